@@ -14,6 +14,7 @@ from casest.diagnose.sensor.unlike import another
 from casest.effects import channel_bias, creep, outliers, signal_lag
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_a_delay_is_no_creep_of_more_than_all_of_the_response(seed):
     """A reading behind a wandering reference by six samples: k = 1.6 imitates that."""

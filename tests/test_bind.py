@@ -427,6 +427,21 @@ def test_a_signal_that_never_changes_is_refused(tmp_path: Path, signal: Signal) 
     assert "signal v (columns vx vy vz) is 1, 2, 3 in all 3 rows; a dead channel" in message
 
 
+def test_a_setting_of_its_own_in_each_run_is_no_dead_channel(tmp_path: Path) -> None:
+    """A motor at 3 V, and at 4 V (a public record was refused)."""
+    signals = [Signal("u", 1, "V"), Signal("y", 1, None)]
+    for k, volts in enumerate((3, 4, 3)):
+        rows = "".join(f"{volts},{y}\n" for y in (1.5, 2.5, 3.0))
+        (tmp_path / f"{k}.csv").write_text(f"u [V],y\n{rows}")
+    files = [str(tmp_path / f"{k}.csv") for k in range(3)]
+    assert [r.signals["u"][0, 0] for r in load_runs(files, signals)] == [3, 4, 3]
+    whole = "u [V],y,run\n3,1,a\n3,2,a\n4,1,b\n4,2,b\n"
+    (tmp_path / "runs.csv").write_text(whole)
+    assert len(load_runs([str(tmp_path / "runs.csv")], signals)) == 2
+    with pytest.raises(DataError, match=r"signal u \(columns u\) is 3 in all 3 rows; a dead"):
+        load_runs([files[0], files[2]], signals)
+
+
 @pytest.mark.parametrize(
     ("size", "words"),
     [

@@ -266,6 +266,7 @@ def test_a_delay_is_found_where_samples_come_at_uneven_times():
     assert abs(value[0] - 0.25) < 4 * closing.after.std[0]
 
 
+@pytest.mark.long
 def test_readings_that_come_a_second_late_are_found_late():
     """Moved by 25 samples they are fewer: what is refitted was compared row by row, and failed."""
     closing = close_motion(bias_gravity, flight(Sensors(delay=1.0), seed=2))

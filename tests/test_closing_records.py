@@ -67,6 +67,7 @@ def improved(result):
 UNITS = [pytest.param(f"imu{k}", marks=[pytest.mark.long] * (k != 1)) for k in range(3)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("unit", UNITS)
 def test_the_mpu9150s_skew_is_found_and_nothing_else(closed, unit):
     """Three units of 23 or fewer positions: the model without skew lacks the skew.

@@ -56,6 +56,7 @@ def test_who_asks_for_it_has_it(closed):
     assert np.abs(found["effects"][0]["parameters"]["k"]["value"]) == pytest.approx(0.02, abs=1e-3)
 
 
+@pytest.mark.long
 def test_a_current_is_a_cause(closed):
     found = closed("current", "amps", "A")
     assert [(e["name"], e["column"]) for e in found["effects"]] == [("channel_gain", "amps")]

@@ -337,6 +337,7 @@ def of_two_causes(rng, few, told, middle, series):
     return linear, a + apart, a
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("few", [3, 12])
 def test_poses_that_were_measured_last_tell_two_causes_apart(few):
     """As often as squares whose difference is normal, N(λ, 4λ), are two errors apart, or less:

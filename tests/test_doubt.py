@@ -80,6 +80,7 @@ def test_two_effects_of_one_column_on_a_prediction_without_a_name_are_both_found
         }  # fmt: skip
 
 
+@pytest.mark.long
 def test_noise_alone_is_a_doubt_no_more_often_than_the_chance():
     model = norm_triangular.having(norm=sim.GRAVITY)
     said = [doubts(attempt(model, poses(seed=k))) for k in range(40)]

@@ -127,6 +127,7 @@ def test_no_control_character_of_a_name_reaches_the_terminal(result, capsys, tex
     assert capsys.readouterr().out.replace("\n", "").isprintable()
 
 
+@pytest.mark.long
 def test_a_column_with_an_escape_sequence_is_named_without_it(tmp_path, capsys):
     rng = np.random.default_rng(4)
     mass, drift = rng.uniform(0, 5, 200), np.linspace(0, 1, 200)

@@ -152,6 +152,7 @@ def test_a_lag_of_a_noisy_reference_is_likelier_than_a_smooth_residual():
         assert gain < 2000 * np.log(before / after)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rho", [0.99, 1.0])
 def test_one_slow_course_does_not_take_another_by_its_squares(rho):
     """Of two walks one takes half of the other's squares in one case of six."""
@@ -552,6 +553,7 @@ def test_one_odd_reading_is_no_evidence_of_a_bend():
     assert chance_by_row(before, after) > 0.1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rows", [19, 36])
 def test_noise_that_is_larger_at_one_end_is_a_bend_no_more_often_than_the_chance(rows):
     """Errors in proportion to the square of the reading: the F test alone says so too often."""

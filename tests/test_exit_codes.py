@@ -254,6 +254,7 @@ def test_without_standard_error_the_answer_is_the_same(capsys):
     assert (closed.returncode, closed.stdout) == (0, capsys.readouterr().out)
 
 
+@pytest.mark.long
 def test_a_reader_who_closes_the_pipe_gets_silence_and_the_files(tmp_path):
     read, write = os.pipe()
     os.close(read)

@@ -25,6 +25,7 @@ def table(rng, rows, axes, unknowns, off=()):
     return r.reshape(rows, axes), X
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("rows", "axes", "unknowns"), [(9, 1, 2), (20, 3, 4), (40, 1, 3)])
 def test_of_normal_noise_no_row_is_spoken_against(rows, axes, unknowns):
     rng, alarms = np.random.default_rng(rows), 0

@@ -19,6 +19,7 @@ def carried_to_and_fro(rng, rows=1500):
     return t, 4 * np.sin(0.9 * t + rng.uniform(0, 6)) + np.sin(2.3 * t)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("end", [-2.0, 1.0])
 def test_readings_that_stop_at_a_lower_end_are_seen_to(tmp_path, seed, end):
@@ -33,6 +34,7 @@ def test_readings_that_stop_at_a_lower_end_are_seen_to(tmp_path, seed, end):
     assert closing.after.values["gain"] == pytest.approx(0.9, abs=0.01)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(4))
 def test_a_bend_is_no_lower_end(tmp_path, seed):
     rng = np.random.default_rng(100 + seed)
@@ -42,6 +44,7 @@ def test_a_bend_is_no_lower_end(tmp_path, seed):
     assert "floor" not in [e.candidate.label for e in closing.effects]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(4))
 def test_inputs_of_one_sign_do_not_tell_it_from_a_dead_band(tmp_path, seed):
     """What begins at a threshold of the input, or the reading's own lower end: one is not claimed

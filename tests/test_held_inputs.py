@@ -54,6 +54,7 @@ def said(linear, load, since):
     return [e.families[0] for e in ranking.found if ranking.says(e)]
 
 
+@pytest.mark.long
 def test_the_errors_of_weights_are_no_effect():
     """Nothing is wrong with 60 cells, and at 1 % something is named; of rows it is in a third."""
     rng = np.random.default_rng(71)
@@ -217,6 +218,7 @@ def stepped(rng, bend=0.0):
     return {"t": 0.034 * np.arange(2400), "reference": reference, "reading": reading}
 
 
+@pytest.mark.long
 def test_what_rows_between_levels_show_is_no_bend():
     """So a current meter of a public record was called bent, with a gain of 1.27 (strangers.md)."""
     closing = casest.close("linear", stepped(np.random.default_rng(0)))

@@ -18,6 +18,7 @@ def still(v=signal("mV"), t=signal("s"), *, level=param("mV")):
 '''
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("again", [False, True])
 def test_a_magnet_that_came_and_went_is_in_no_other_record(tmp_path, capsys, again):
     """A pulse of 5 mV from 20 to 30 s, in noise of 0.1 mV; the other record has none.

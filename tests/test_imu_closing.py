@@ -102,6 +102,7 @@ def test_an_offset_that_follows_temperature_is_named_and_found(tmp_path):
     assert np.abs((np.array(found["value"]) + k) / np.array(found["std"])).max() < 4
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("gain", "code"), [(1.008, 2), pytest.param(1.0, 0, marks=pytest.mark.long)]
 )

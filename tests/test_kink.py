@@ -39,6 +39,7 @@ def fits():
     return [(run, attempt(spring, [run])) for run in map(record, range(60))]
 
 
+@pytest.mark.long
 def test_a_kink_is_found_and_proved_where_no_threshold_around_fits_better(fits):
     kinks = 0
     for run, found in fits:

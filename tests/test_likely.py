@@ -88,6 +88,7 @@ def optimum(run):
 MODEL = turned.sensing(rate=GYRO**2 * STEP)
 
 
+@pytest.mark.long
 def test_the_smoother_finds_the_joint_optimum_of_states_and_noise():
     rng = np.random.default_rng(1)
     for seed in range(3):

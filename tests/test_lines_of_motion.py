@@ -38,6 +38,7 @@ def test_a_gain_that_changes_a_little_leaves_no_vibration(tmp_path, seed):
     assert "vibration" not in found_in(file)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_multiples_of_a_wave_are_no_vibration(tmp_path, seed):
     """Steps of a converter bend a wave: overtones that no curve of the catalogue tells."""
@@ -65,6 +66,7 @@ def late(tmp_path, rng, x, by, noise):
     return written(tmp_path / "late.csv", t, x(t), y + noise * rng.standard_normal(ROWS))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(4))
 def test_a_wave_is_late_by_less_than_half_a_period(tmp_path, seed):
     """What is left of a poor fit may make whole periods later a little likelier."""

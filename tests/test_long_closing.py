@@ -92,6 +92,7 @@ def run_of(**how):
 # -- the same as in memory -------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_record_that_is_looked_at_whole_is_closed_as_any_other(there, capsys):
     pq.write_table(table(count=1500, bend=0.05), "short.parquet")
     _, found, _ = closed(capsys, "short.parquet", "--partitions")
@@ -103,6 +104,7 @@ def test_a_record_that_is_looked_at_whole_is_closed_as_any_other(there, capsys):
     assert (record["samples"], record["looked_at_every"]) == (1500, 1)
 
 
+@pytest.mark.long
 def test_the_cause_and_the_numbers_are_those_of_the_record_in_memory(there, capsys):
     pq.write_table(table(bend=0.05), "long.parquet")
     code, found, _ = closed(capsys, "long.parquet", "--partitions", "-o", "out")
@@ -170,6 +172,7 @@ def test_the_score_of_a_cause_is_that_of_its_fit(there):
     assert own.share == pytest.approx(1 - costs[1] / costs[0], rel=1e-6)
 
 
+@pytest.mark.long
 def test_what_is_too_small_for_the_rows_is_named_by_all_samples(there):
     run = run_of(count=400_000, bend=0.0015)
     few = looked_at(run, spacing(len(run)))

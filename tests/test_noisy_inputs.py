@@ -131,6 +131,7 @@ def test_stated_noise_of_an_input_counts_once_beside_a_memory(effect, on):
     assert 0.001 < chi2.cdf(found.value, found.degrees_of_freedom) < 0.999
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("noise", [None, {"ref": 75, "cell": 75}])
 def test_a_lag_is_found_whether_the_noise_of_its_input_is_stated_or_not(noise):
     """Before, "too uncertain for its intervals": its cost is no parabola, since a signal that was

@@ -73,6 +73,7 @@ def rise_of_a_drift(seed, offset):
     return found
 
 
+@pytest.mark.long
 def test_flicker_noise_of_an_offset_looks_like_a_drift_and_beside_a_wander_it_does_not():
     """Three unknowns gain 16 in one of a thousand records of white noise."""
     every = [rise_of_a_drift(seed, lambda rng, n: 3 * flicker(rng, n)) for seed in range(60)]

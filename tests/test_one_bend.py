@@ -67,6 +67,7 @@ def test_an_angle_of_a_few_degrees_is_no_harmonic():
     assert closing.after.values["offset"] == pytest.approx(0.3 - 0.083 * 1.2, abs=0.1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("top", [4095.0, 3800.0])
 def test_a_ramp_that_ends_at_a_full_scale(tmp_path, capsys, top):
     """A converter on a slow ramp: it climbs count by count, and bends on the way."""

@@ -139,6 +139,7 @@ def wheel(speed=signal("rad/s"), *, omega=state("rad/s", start=25),
 """
 
 
+@pytest.mark.long
 def test_an_output_that_repeats_is_missing_and_its_damping_is_found(tmp_path, capsys):
     """Solved by hand: a/k + (ω₀ − a/k)·exp(−kt). Zeros in the place of what was not read made the
     noise none, and the damping was refused."""

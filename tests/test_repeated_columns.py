@@ -87,6 +87,7 @@ def test_what_rises_wherever_the_reading_does_explains_nothing(record, whole):
     assert "column is reading once more" in skipped(closing)["raw"]
 
 
+@pytest.mark.long
 def test_of_columns_that_go_with_the_input_none_is_claimed_where_the_response_bends(record):
     """Set value, current and meter of a lamp: what they do can be a bend, and is one."""
     rng = np.random.default_rng(3)
@@ -190,6 +191,7 @@ def swung(rng, frequencies, late=0.007, step=0.002, rows=3000):
     return {"t": t, "reference": noisy, "reading": gyro, "angle": np.round(angle, 3)}
 
 
+@pytest.mark.long
 def test_in_one_sine_the_angle_is_the_rate_at_another_time():
     """A bias over the angle would explain all of the lag, with a size that goes as f²."""
     closing = close("linear", swung(np.random.default_rng(11), [5.0]))
@@ -198,6 +200,7 @@ def test_in_one_sine_the_angle_is_the_rate_at_another_time():
     assert closing.after.values["gain"] == pytest.approx(0.257, rel=0.03)
 
 
+@pytest.mark.long
 def test_in_a_motion_of_several_frequencies_the_angle_is_a_column_of_its_own():
     record = swung(np.random.default_rng(12), [0.7, 2.3, 5.0])
     closing = close("linear", record)

@@ -47,6 +47,7 @@ def recorded(x):
     return [Run.raw("ring", columns, units={"t": "s", "x": "V"}, time=T)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(2))
 def test_a_balance_in_a_draught_is_not_adequate(seed):
     """It swings by 0.05 V for another reason; readings are good to 0.002 V."""
@@ -56,6 +57,7 @@ def test_a_balance_in_a_draught_is_not_adequate(seed):
     assert "between rows with nearly the same inputs" in closing.misfit.where
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [3, 4])
 def test_noise_that_neighbours_share_for_five_samples_is_noise(seed):
     """A wave below noise that remembers as exp(−k/5): neighbours share nine tenths of that too."""

@@ -53,6 +53,7 @@ def turned(n, jump, seed):
     return reading, there
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("jump", "within"), [((1.5, 5.5, 5.6), 0.06), ((0.3, -0.2, 0.4), 0.75)])
 def test_a_magnet_that_comes_and_goes_is_found_in_the_length_of_the_field(jump, within):
     """Also one of 40 standard deviations, which the declared fit is spoilt by.

@@ -128,6 +128,7 @@ def test_a_plain_misfit_of_a_short_series_is_seen(rows, misfit):
         assert doubts(attempt(probe, [short_record(rows, seed, misfit)]))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rows", [40, 99, 100, 220])
 def test_a_short_series_without_one_leaves_noise(rows):
     """Each question has a chance of 0.001, and there are five at most."""

@@ -23,6 +23,7 @@ def z_of(found):
     return (float(found.values["gain"]) - 2) / float(found.std["gain"])
 
 
+@pytest.mark.long
 def test_a_gain_that_differs_from_spell_to_spell_is_as_uncertain_as_it_says(tmp_path):
     """By gains that differ so little that no residual shows it: 2 % of the noise's squares."""
     z = []
@@ -33,6 +34,7 @@ def test_a_gain_that_differs_from_spell_to_spell_is_as_uncertain_as_it_says(tmp_
     assert np.sqrt(np.mean(np.square(z))) == pytest.approx(1.0, abs=0.25)
 
 
+@pytest.mark.long
 def test_spells_that_agree_change_nothing(tmp_path):
     """But in one record of a hundred."""
     changed = 0
@@ -43,6 +45,7 @@ def test_spells_that_agree_change_nothing(tmp_path):
     assert changed <= 4  # p = 0.0003
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("freedom", [4.0, 9.0, 39.0])
 def test_chance_alone_contradicts_a_variance_as_seldom_as_it_says(freedom):
     rng, many, unknowns, contradictions = np.random.default_rng(3), 10_000, 4, 0

@@ -102,6 +102,7 @@ def test_residuals_that_look_correlated_by_chance_know_no_better(seed):
     assert np.sqrt(np.diag(found.covariance - found.shift)) == pytest.approx(expected, rel=0.03)
 
 
+@pytest.mark.long
 def test_a_norm_of_unequal_noise_is_right_to_second_order():
     """Without the noise the fit of so many readings is off by many of its standard deviations."""
     rng = np.random.default_rng(3)

@@ -96,6 +96,7 @@ def test_a_bend_is_seen_in_a_table_of_any_length(rows):
     assert of_table(beside_a_line(x, np.sin(5 * x)), x)[0].p_value < LEVELS.misfit
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rows", [12, 20, 40, 100, 300])
 def test_noise_of_a_table_follows_nothing_whatever_its_tails_and_where_it_is_larger(rows):
     """Also of noise that grows thirtyfold along the order: in 2 of 100 tables at most, not in 1."""

@@ -214,6 +214,7 @@ def test_what_a_study_found_named_wrongly_is_named(study, kind, seed, name):
     assert said["later_after"] < 1.05 * said["later_oracle"]
 
 
+@pytest.mark.long
 def test_in_few_poses_a_rival_on_its_own_axes_is_said(study):
     """Of 29 poses a dead zone explains as much as one gain that differs, on all axes not."""
     said = study("loop_worlds").one_world("gains unlike", 270005, True)
@@ -221,6 +222,7 @@ def test_in_few_poses_a_rival_on_its_own_axes_is_said(study):
     assert found["name"] == "axis_gain" or "axis_gain" in found["alike"][:2]
 
 
+@pytest.mark.long
 def test_what_explains_as_much_as_a_lag_is_said(study):
     """A cycled cell with hysteresis: a lag was claimed, and nothing said to be like it."""
     said = study("loop_worlds").one_world("load cell with hysteresis", 290000, True)

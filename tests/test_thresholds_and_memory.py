@@ -33,6 +33,7 @@ def names(closing):
     return {e.candidate.label for e in closing.effects}
 
 
+@pytest.mark.long
 def test_a_breakaway_before_a_low_pass_is_found_with_both_its_sizes():
     """Before: creep, a quadratic and a cubic."""
     closing = close("linear", motor(0))
@@ -45,6 +46,7 @@ def test_a_breakaway_before_a_low_pass_is_found_with_both_its_sizes():
     assert tau == pytest.approx(1.5, abs=0.05)
 
 
+@pytest.mark.long
 def test_a_low_pass_of_many_samples_that_is_asked_for_is_judged_by_its_refit():
     """Before: "no more of it than noise would have (p = 0.17)", by its slope at no time at all."""
     closing = close("linear", motor(1), known=["low_pass"])
@@ -69,6 +71,7 @@ def test_a_threshold_of_the_input_is_told_beside_an_offset(seed):
     assert float(np.ravel(width)[0]) == pytest.approx(1.1, abs=0.12)
 
 
+@pytest.mark.long
 def test_a_threshold_whose_best_size_is_that_of_a_row_is_added_too():
     """The cost has a kink there, and no slope is zero: it was named and not added."""
     closing = close("linear", spring(0))
@@ -100,6 +103,7 @@ def smoothed(x, share):
     return lfilter([1 - share], [1, -share], x)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("seed", "lag"), [(100, 0.3), (102, 0.23)])
 def test_a_lag_is_no_low_pass_because_that_smooths_the_reference(seed, lag):
     """A filter takes noise of the reference from the residual as well, which is no sign of it.

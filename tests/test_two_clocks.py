@@ -28,6 +28,7 @@ def record(seed, late, noise):
     return {"t": STEP * np.arange(ROWS), "reference": reference, "reading": reading}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("late", [15, -40])
 def test_a_lag_behind_a_noisy_reference_is_found(late):
     """What it leaves is noise; without it the gain is off by a third, and the residual as smooth as

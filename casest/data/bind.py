@@ -6,7 +6,7 @@ import os
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,14 @@ from casest.errors import DataError, UnitError, UsageError
 Path_ = str | os.PathLike[str]
 #: A table in memory: a data frame of any library, a mapping of arrays, an array.
 Frame = Any
+
+
+class _Met(NamedTuple):
+    """Values (N, size) of a signal in one run, with the columns of its file."""
+
+    file: str
+    columns: tuple[str, ...]
+    values: Array
 
 
 @dataclass(frozen=True)
@@ -110,7 +118,9 @@ def load_runs(
     )
     groups = [_tables(given, k if len(listed) > 1 else None) for k, given in enumerate(listed)]
     refuse_unknown_names([table for tables in groups for table in tables], wanted, options)
-    runs = [run for tables in groups for run in _group_runs(tables, wanted, options)]
+    met = dict[str, list[_Met]]()
+    runs = [run for tables in groups for run in _group_runs(tables, wanted, options, met)]
+    _refuse_dead(met)
     runs = _named_apart(runs)
     if at_rest is not False:
         also = () if at_rest is True else tuple(at_rest)
@@ -152,15 +162,28 @@ def _tables(given: Any, place: int | None) -> list[Table]:
     return [table_of(given, kind if place is None else f"{kind} {place}")]
 
 
-def _group_runs(tables: Sequence[Table], signals: Sequence[Signal], options: Options) -> list[Run]:
-    """The runs of one file, or the one run of several files."""
+def _refuse_dead(met: Mapping[str, Sequence[_Met]]) -> None:
+    """Refuse a signal that is one value in all runs: another one in each is a run's setting."""
+    for name, every in met.items():
+        values = [one.values for one in every]
+        if all(checks.constant(v) and np.array_equal(v[0], values[0][0]) for v in values):
+            checks.refuse_constant(every[0].file, name, values[0], every[0].columns)
+
+
+def _group_runs(
+    tables: Sequence[Table],
+    signals: Sequence[Signal],
+    options: Options,
+    met: dict[str, list[_Met]],
+) -> list[Run]:
+    """The runs of one file, or the one run of several files; adds what their signals `met`."""
     if len(tables) == 1:
-        runs = _runs(tables[0], signals, options)
+        runs = _runs(tables[0], signals, options, met)
         return [one_clock_each(run, signals, options) for run in runs]
     apart = replace(options, time_zero="column")
     parts = []
     for table, own, chosen in shared_out(tables, signals, apart):
-        runs = _runs(table, own, chosen)
+        runs = _runs(table, own, chosen, met)
         if len(runs) > 1:
             raise DataError(
                 f"{table.file}: holds {len(runs)} runs, and files joined by + are one: give the "
@@ -172,7 +195,9 @@ def _group_runs(tables: Sequence[Table], signals: Sequence[Signal], options: Opt
     return [joined(parts, signals, options.time_zero)]
 
 
-def _runs(table: Table, signals: Sequence[Signal], options: Options) -> list[Run]:
+def _runs(
+    table: Table, signals: Sequence[Signal], options: Options, met: dict[str, list[_Met]]
+) -> list[Run]:
     """Bind one table and cut it into its runs."""
     bound = _bind(table, signals, options)
     groups = {kind: _group(table, kind, options) for kind in ("run", "pose")}
@@ -218,7 +243,7 @@ def _runs(table: Table, signals: Sequence[Signal], options: Options) -> list[Run
             notes=(*table.notes, *bound.notes, *dropped, *notes, *order_notes, *time_notes),
         )
         varying = [s for s in signals if s.name not in options.steady]
-        runs.append(_checked(run, varying, bound.sources))
+        runs.append(_checked(run, varying, bound.sources, met))
     return runs
 
 
@@ -542,15 +567,21 @@ def _others(
     return columns, units, notes
 
 
-def _checked(run: Run, signals: Sequence[Signal], sources: Mapping[str, tuple[str, ...]]) -> Run:
-    """Refuse signals that never change; note components that are dead or clipped."""
+def _checked(
+    run: Run,
+    signals: Sequence[Signal],
+    sources: Mapping[str, tuple[str, ...]],
+    met: dict[str, list[_Met]],
+) -> Run:
+    """Note components that are dead or clipped; and what the signals `met`, to be looked at in all
+    runs."""
     notes: list[str] = []
     for signal in signals:
         if is_time(signal) or signal.kind == "rotation":
             continue
         values, columns = run.signals[signal.name], sources[signal.name]
         values = checks.without_gaps(values)
-        checks.refuse_constant(run.file, signal.name, values, columns)
+        met.setdefault(signal.name, []).append(_Met(run.file, columns, values))
         others = [
             run.signals[s.name]
             for s in signals

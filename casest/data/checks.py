@@ -29,9 +29,14 @@ def without_gaps(values: Array) -> Array:
     return values if whole.all() else values[whole]
 
 
+def constant(values: Array) -> bool:
+    """Are all samples of a signal (N, size), several of them, identical?"""
+    return len(values) > 1 and bool((values == values[0]).all())
+
+
 def refuse_constant(file: str, name: str, values: Array, columns: tuple[str, ...]) -> None:
     """Raise DataError where all samples of a signal (N, size) are identical."""
-    if len(values) > 1 and bool((values == values[0]).all()):
+    if constant(values):
         shown = ", ".join(f"{value:g}" for value in values[0])
         raise DataError(
             f"{file}: signal {name} (columns {' '.join(columns)}) is {shown} in all "
@@ -68,7 +73,7 @@ def refuse_too_small(file: str, name: str, values: Array, columns: tuple[str, ..
 
 def constant_columns(values: Array, columns: tuple[str, ...]) -> list[str]:
     """Return a note for each component that never changes while others do."""
-    if len(values) < 2:
+    if len(values) < 2 or constant(values):
         return []
     still = (values == values[0]).all(axis=0)
     return [

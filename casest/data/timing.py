@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 GAP = 5.0  # times the usual step
 USUAL = 0.8  # share of the steps that do not exceed it
-_BACK = 0.1  # share of steps back from which on a column is no time
+_BACK = 0.1  # share of steps back from which on a column is no time, and of none where it is coarse
 _LATE = 20  # places by which a row that comes late may be off
 _LOG = 100  # rows from which on those of one stamp are a log's, no repeats of a table
 _EVEN = 20  # steps that show whether a record is evenly sampled
@@ -281,7 +281,7 @@ def within_stamps(time: Array) -> tuple[Array, str] | None:
     say of that; None where stamps go back, or where the clock is fine and a row is there twice."""
     steps = np.diff(time)
     again = steps == 0
-    if len(time) < _LOG or not again.any() or (steps < 0).any() or again.all():
+    if len(time) < _LOG or np.mean(again) < _BACK or (steps < 0).any() or again.all():
         return None
     tick, usual = float(steps[~again].min()), float(np.median(steps[~again]))
     if tick < 0.5 * usual:

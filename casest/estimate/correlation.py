@@ -13,6 +13,9 @@ from casest.leastsquares.sums import SAMPLED
 #: Fewer samples in a run say nothing about correlation: of readings, and of rest intervals, which
 #: are known to have followed each other.
 ENOUGH, ENOUGH_RESTS = 100, 30
+#: Rows from which on neighbours that are alike count in standard deviations: a series of fewer than
+#: ENOUGH is judged like a table.
+ENOUGH_ALIKE = 30
 #: Fewer rows without a time are a table, whose order is nobody's.
 TABLE = 500
 
@@ -26,7 +29,7 @@ def correlation_time(problem: Problem, point: Point, tables: bool = False) -> fl
     """
     times, weights = [], []
     for run, pieces in zip(problem.runs, _stretches(problem, point), strict=True):
-        if not (is_series(run) or (tables and len(run) >= ENOUGH)):
+        if not (is_series(run) or (tables and not run.spread and len(run) >= ENOUGH_ALIKE)):
             continue
         for k in range(len(problem.model.axes)):
             times.append(_integrated([piece[:, k] for piece in pieces]))

@@ -14,7 +14,7 @@ from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.estimate.before import against_prior
 from casest.estimate.certificate import Certificate, one_sided
-from casest.estimate.correlation import ENOUGH, TABLE, alike_over, correlation_time
+from casest.estimate.correlation import ENOUGH, alike_over, correlation_time, is_series
 from casest.estimate.covariance import inverse_normal, sandwich
 from casest.estimate.evidence import Evidence, remarks
 from casest.estimate.on_bounds import free_of
@@ -243,12 +243,16 @@ class Estimate:
 
 def _of_tables(problem: Problem, point: Point) -> Iterator[str]:
     """That neighbouring rows of a table are alike, as if they followed each other in time."""
-    if not any(run.time is None and ENOUGH <= len(run) < TABLE for run in problem.runs):
-        return
-    over = correlation_time(problem, point, tables=True)
+    tables = [run for run in problem.runs if not is_series(run)]
+    over = correlation_time(problem, point, tables=True) if tables else 1.0
     if over > 1:
+        timed = any(run.time is not None or len(run) < ENOUGH for run in tables)
+        causes = (
+            f"in fewer than {ENOUGH} rows"
+            if timed
+            else "in rows without a time; if they followed each other, say so with --rate"
+        )
         yield (
             f"residuals of neighbouring rows are alike (over {over:.2g} rows): standard deviations "
-            "allow for that, causes do not in rows without a time; if they followed each other, "
-            "say so with --rate"
+            f"allow for that, causes do not {causes}"
         )
