@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from casest.data.run import Run
+from casest.data.stillness import resolution
 from casest.declaration.effect import OVER_TIME
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
@@ -23,6 +24,8 @@ ALIKE = 1 + 2 * (15**2 + 6**2 + 1) / 20**2
 #: Chance that the noise of few rows is less than the bound that is taken; standard errors by which
 #: that of many may be more than it seems.
 SURE, ABOVE = 0.95, 2.0
+#: Share of rows that repeat the one before where an input is held, and part of a step.
+HELD, HALF = 0.5, 0.5
 #: Third differences that say as much of their spread by its median as one without it (the median
 #: deviation's efficiency), and the normal deviate of a lower quarter.
 BY_MEDIAN, QUARTER = 0.37, 0.674
@@ -59,7 +62,17 @@ def noise_of_inputs(
     for name, square in squares.items():
         if np.isfinite(square) and square > 0:
             size = noise * float(np.sqrt(plain.residual_count / square))
-            yield name, _white(of([run.signals[name] for run in plain.runs]), spans, size)
+            values = of([run.signals[name] for run in plain.runs])
+            yield name, min(_white(values, spans, size), _where_held(values))
+
+
+def _where_held(values: Array) -> float:
+    """The most noise that values (N, k) may have which repeat in half of the rows: half a step of
+    them, since noise of more takes a reading to another step. A command is held to its last digit.
+    """
+    if len(values) < 2 or not np.all(np.mean(np.diff(values, axis=0) == 0, axis=0) > HELD):
+        return np.inf
+    return HALF * max(resolution(values[:, k]) for k in range(values.shape[1]))
 
 
 def at_once(model: Model) -> Model:
