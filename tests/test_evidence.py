@@ -12,6 +12,7 @@ from scipy.integrate import quad
 from scipy.linalg import solve_triangular, toeplitz
 from scipy.signal import butter, lfilter
 
+from casest import close
 from casest.diagnose.evidence.by_row import chance_by_row
 from casest.diagnose.evidence.likelihood import Beyond, Likelihood
 from casest.diagnose.evidence.linear import Linear, parts_of
@@ -588,3 +589,21 @@ def test_what_one_row_alone_says_is_no_evidence():
     found = judged([trial_of(pulse, "pulse")], likelihood, likelihood.beside())
     assert found.p_value < 1e-6
     assert chance_by_row(before, after) > 0.5
+
+
+def test_the_chance_that_is_printed_is_that_of_the_refit(tmp_path):
+    """A threshold in 60 rows: by SciPy the F test of the least squares with it and without, shared
+    among all that was looked through. Its columns at nothing promised far less."""
+    rng = np.random.default_rng(11)
+    u = rng.uniform(0, 5, 60)
+    y = 1 + 2 * np.maximum(u - 1.5, 0) + 0.05 * rng.standard_normal(60)
+    (effect,) = close("linear", {"reference": u, "reading": y}).effects
+    assert effect.candidate.label == "dead_band"
+
+    def left(width):
+        X = np.column_stack([np.ones(60), np.maximum(u - width, 0)])
+        return float(np.linalg.lstsq(X, y)[1][0])
+
+    best = min(left(w) for w in np.linspace(1.3, 1.7, 401))
+    alone = stats.f.sf((left(-1.0) / best - 1) * 57, 1, 57)
+    assert alone < effect.p_value < 1e5 * alone  # values of its grid times effects
