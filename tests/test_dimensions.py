@@ -152,3 +152,12 @@ def test_a_unit_in_brackets_may_be_that_of_a_quantity():
     check_units(lever("V/[path]"))
     with pytest.raises(UnitError, match="prediction of v"):
         check_units(lever("V*[path]"))
+
+
+def test_of_a_signal_without_a_unit_it_is_said_which_unit_an_unknown_has():
+    @model
+    def focus(distance=signal("mm"), position=signal(), *, base=param(), k=param("mm")):
+        return Residual(measured=position, predicted=base + k / distance)
+
+    with pytest.raises(UnitError, match=r'like param\("\[position\]"\) in the unit of a signal'):
+        check_units(focus)

@@ -107,3 +107,19 @@ def test_rows_that_led_an_estimate_astray_are_named_where_it_is_refused(
     said = capsys.readouterr().err
     assert "of the residual is in rows 2" in said
     assert "27 of table, which the others speak against: look at these first; " in said
+
+
+def test_so_are_the_rows_of_a_series_that_are_far_out(tmp_path, capsys):
+    """A magnetometer turned by hand, with a magnet nearby in one row of forty."""
+    rng = np.random.default_rng(3)
+    n = rng.standard_normal((2000, 3))
+    field = 45 * n / np.linalg.norm(n, axis=1)[:, None] * [1.05, 0.95, 1.0] + [3, -2, 1]
+    field += 0.5 * rng.standard_normal(field.shape)
+    field[::40] += 40 * rng.standard_normal((50, 3))
+    path = tmp_path / "hand.csv"
+    rows = np.column_stack([0.02 * np.arange(2000), field])
+    np.savetxt(path, rows, delimiter=",", header="t [s],mx [uT],my [uT],mz [uT]", comments="")
+    said = ["calibrate", "norm-triangular", str(path), "--columns", "v=mx,my,mz"]
+    assert run([*said, "--set", "norm=45 uT"]) == 2
+    told = capsys.readouterr().err
+    assert "98 % of the residual is in 45 of 2000 rows, which are far out, most of all row " in told

@@ -296,4 +296,6 @@ def _way_out(a: Size, b: Size) -> str:
         said = f"one kind in two units, {high / low:.4g} to 1: declare both in one of them"
         degrees = abs(high / low * math.pi / 180 - 1) < 1e-9
         return said + (", or multiply degrees by pi / 180" if degrees else "")
-    return "declare another unit, or mend the formula"
+    open_ = next((u for s in (a, b) for u in s.powers or {} if u.startswith("[")), "")
+    own = f', like param("{open_}") in the unit of a signal that has none' if open_ else ""
+    return f"declare another unit{own}, or mend the formula"

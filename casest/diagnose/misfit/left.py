@@ -19,6 +19,7 @@ from casest.diagnose.candidates.candidates import Candidate
 from casest.diagnose.found import Course, Undecided
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.misfit.findings import (
+    FAULTS,
     Finding,
     findings,
     in_few_rows,
@@ -50,16 +51,35 @@ def doubts(estimate: Estimate) -> list[Finding] | None:
 
 def refused_for(estimate: Estimate) -> str:
     """Why an estimate is refused; first the few rows that most of its residual is in: they may have
-    led it astray (a table that stood still in two of thirty rests)."""
+    led it astray (a table that stood still in two of thirty rests, a magnet nearby)."""
     problem, why = estimate.problem, list(estimate.certificate.reasons)
     with np.errstate(all="ignore"):
         point = problem.point(estimate.values)
-        few = sum(map(len, problem.runs)) < LEVELS.series
-        if few and all(np.isfinite(r).all() for r in problem.residuals(point)):
-            found = in_few_rows(problem, point)
-            where = [f.where.replace("of it", "of the residual", 1) for f in found]
+        residuals = problem.residuals(point)
+        if all(np.isfinite(r).all() for r in residuals):
+            series = sum(map(len, problem.runs)) >= LEVELS.series
+            where = _far_rows(problem, residuals) if series else _few_rows(problem, point)
             why = [*(f"{w}: look at these first" for w in where), *why]
     return "; ".join(why)
+
+
+def _few_rows(problem: Problem, point: Point) -> list[str]:
+    return [f.where.replace("of it", "of the residual", 1) for f in in_few_rows(problem, point)]
+
+
+def _far_rows(problem: Problem, residuals: Sequence[Array]) -> list[str]:
+    """Rows of a series far out, no more than faults are among readings, that hold most of it."""
+    squares = np.concatenate([np.sum(r**2, axis=1) for r in residuals])
+    far = squares > (LEVELS.beyond * robust_scale(residuals)) ** 2
+    share = float(squares[far].sum() / max(squares.sum(), 1e-300))
+    if not 0 < np.mean(far) <= FAULTS or share <= LEVELS.most:
+        return []
+    worst = int(np.argmax(squares))
+    names = [f"row {k} of {run.name}" for run in problem.runs for k in run.rows]
+    return [
+        f"{100 * share:.0f} % of the residual is in {int(far.sum())} of {len(far)} rows, which are "
+        f"far out, most of all {names[worst]}"
+    ]
 
 
 @dataclass(frozen=True)
