@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from casest import Residual, Run, if_else, model, param, signal
+from casest import Residual, Run, close, if_else, model, param, signal
 from casest.estimate.calibrate import attempt
 from casest.estimate.kink import at_kink, left_at_kink
+from casest.results.closing import closing_result
 
 WEIGHTS = np.linspace(0, 8, 60)
 
@@ -84,3 +85,23 @@ def test_a_largest_cost_with_a_kink_is_not_proved():
     point = found.point({"a": 0.0})
     assert left_at_kink(found, point, 1.0) is None
     assert at_kink(found, point, 1.0) is None
+
+
+def test_a_threshold_beyond_which_all_lies_is_said_to_be_an_offset(tmp_path):
+    """A distance counted from a plane 200 mm off: of a lens, reading base + k / distance."""
+    (tmp_path / "lens.py").write_text(
+        "from casest import Residual, model, param, quantity, signal\n\n\n@model\n"
+        'def lens(d=signal("mm"), y=signal("V"), *, base=param("V"), k=param("V*mm", start=9.0)):\n'
+        '    """An encoder behind a lens."""\n'
+        '    far = quantity("far", d, "mm")\n'
+        "    return Residual(measured=y, predicted=base + k / far, corrected=far)\n"
+    )
+    rng = np.random.default_rng(4)
+    d = np.linspace(340, 660, 60)
+    y = 1 + 900 / (d - 200) + 0.002 * rng.standard_normal(60)
+    found = close(str(tmp_path / "lens.py"), {"d": d, "y": y})
+    result = closing_result(found, model_name="lens", data=[])
+    assert [e.name for e in result.effects] == ["dead_band"]
+    (note,) = (n for n in result.notes if "lies beyond the width" in n)
+    assert note.startswith("all of far lies beyond the width of dead_band, on one side: there")
+    assert float(note.rpartition(" ")[2]) == pytest.approx(200, abs=5)

@@ -4,7 +4,7 @@ left unexplained."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,6 +16,8 @@ from casest.diagnose.closing import Closing
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.noise.attenuation import attenuated
 from casest.diagnose.visibility import Visible
+from casest.effects.placing import prepared
+from casest.leastsquares.problem import Problem
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,29 @@ def _noise_of_inputs(closing: Closing) -> Iterator[Invisible]:
             unit = closing.after.model[name].unit or f"[{name}]"
             yield Invisible(f"noise of {name}", None, {"std": size}, moves, 1.0, shown_by,
                             {"std": unit})  # fmt: skip
+
+
+def beyond_their_ends(closing: Closing) -> Iterator[str]:
+    """Thresholds that were added and beyond which all lies, on one side: what they are there."""
+    added = {f.candidate.label for f in closing.effects}
+    model, values = closing.after.model, closing.after.values
+    for attached in (a for a in model.effects if a.label in added):
+        ends = [n for n, kind in attached.effect.profile if kind in ("band", "threshold")]
+        widths = [values[f"{attached.label}.{n}"] for n in ends]
+        less = replace(model, effects=tuple(a for a in model.effects if a is not attached))
+        place = less.along.quantities.get(attached.on)
+        if not widths or place is None or np.min(widths[0]) <= 0:
+            continue
+        problem = Problem(less, prepared(less, closing.after.problem.runs))
+        point = problem.point(less.among(values))
+        met = [found[0][:, :, 0] for found in problem.evaluate(point, {"q": place.value})]
+        every, width = np.concatenate(met), widths[0]
+        if np.all(every > width) or np.all(every < -width):
+            size = ", ".join(f"{w:.4g}" for w in np.atleast_1d(width))
+            yield (
+                f"all of {attached.on} lies beyond the width of {attached.label}, on one side: "
+                f"there it is an offset of {attached.on}, by {size}"
+            )
 
 
 def _harm(closing: Closing, hidden: Invisible) -> float:
