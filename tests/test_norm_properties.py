@@ -119,7 +119,8 @@ def test_every_reading_twice_keeps_the_estimate_and_shrinks_the_std_by_the_squar
     shrunk = np.sqrt((len(v) - n) / (2 * len(v) - n))
     for name in ("scale", "offset"):
         assert_same(other.values[name], one.values[name], one.std[name])
-        np.testing.assert_allclose(other.std[name], shrunk * one.std[name], rtol=1e-6)
+        # Twice the rows may look alike where half of them do not: of that `std` knows besides.
+        np.testing.assert_allclose(other.plain[name], shrunk * one.plain[name], rtol=1e-6)
 
 
 @modest
