@@ -17,7 +17,7 @@ from casest.errors import DataError, NotTrusted, UsageError
 from casest.estimate import reasons as words
 from casest.estimate.by_estimator import by_estimator
 from casest.estimate.certificate import Certificate, certify, settled, slope_and_step
-from casest.estimate.correlation import alike_over, correlation_time
+from casest.estimate.correlation import ENOUGH, alike_over, correlation_time
 from casest.estimate.covariance import as_stated, covariance_of, inverse_normal, no_less
 from casest.estimate.errors_of_inputs import solved, with_errors_of_inputs
 from casest.estimate.estimate import Estimate as Estimate
@@ -309,7 +309,7 @@ def _looked_at_for_a_better_one(found: Estimate) -> Estimate:
     a poor fit makes neighbours so alike. A start of the user's own says that this is the valley.
     """
     places = valleys(found.outcomes)
-    over = correlation_time(found.problem, found.point, tables=True) if places > 1 else 1.0
+    over = correlation_time(found.problem, found.point, tables=ENOUGH) if places > 1 else 1.0
     timed = any(run.time is not None for run in found.problem.runs)
     if timed or over <= POOR:
         return found

@@ -20,16 +20,17 @@ ENOUGH_ALIKE = 30
 TABLE = 500
 
 
-def correlation_time(problem: Problem, point: Point, tables: bool = False) -> float:
+def correlation_time(problem: Problem, point: Point, tables: int | None = None) -> float:
     """Samples per independent residual: 1 + 2·Σ autocorrelations, 1 where they are not significant.
 
-    Runs of fewer than ENOUGH samples (of poses) count as uncorrelated, and so do `tables`, rows
-    without a time, unless asked for. The sum stops where pairs of neighbouring autocorrelations
-    stop being positive (Geyer 1992).
+    Runs of fewer than ENOUGH samples (of poses) count as uncorrelated, and so do rows without a
+    time; of such `tables` those of so many rows and more count, where asked for. The sum stops
+    where pairs of neighbouring autocorrelations stop being positive (Geyer 1992).
     """
     times, weights = [], []
     for run, pieces in zip(problem.runs, _stretches(problem, point), strict=True):
-        if not (is_series(run) or (tables and not run.spread and len(run) >= ENOUGH_ALIKE)):
+        table = tables is not None and not run.spread and len(run) >= tables
+        if not (is_series(run) or table):
             continue
         for k in range(len(problem.model.axes)):
             times.append(_integrated([piece[:, k] for piece in pieces]))
@@ -43,7 +44,7 @@ def alike_over(problem: Problem, point: Point, correlated_over: float) -> float:
     table's order is nobody's, but where its neighbours are alike they are not independent."""
     if all(is_series(run) for run in problem.runs):
         return correlated_over
-    return max(correlated_over, correlation_time(problem, point, tables=True))
+    return max(correlated_over, correlation_time(problem, point, tables=ENOUGH_ALIKE))
 
 
 def is_series(run: Run) -> bool:

@@ -14,7 +14,13 @@ from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.estimate.before import against_prior
 from casest.estimate.certificate import Certificate, one_sided
-from casest.estimate.correlation import ENOUGH, alike_over, correlation_time, is_series
+from casest.estimate.correlation import (
+    ENOUGH,
+    ENOUGH_ALIKE,
+    alike_over,
+    correlation_time,
+    is_series,
+)
 from casest.estimate.covariance import inverse_normal, sandwich
 from casest.estimate.evidence import Evidence, remarks
 from casest.estimate.on_bounds import free_of
@@ -244,7 +250,7 @@ class Estimate:
 def _of_tables(problem: Problem, point: Point) -> Iterator[str]:
     """That neighbouring rows of a table are alike, as if they followed each other in time."""
     tables = [run for run in problem.runs if not is_series(run)]
-    over = correlation_time(problem, point, tables=True) if tables else 1.0
+    over = correlation_time(problem, point, tables=ENOUGH_ALIKE) if tables else 1.0
     if over > 1:
         timed = any(run.time is not None or len(run) < ENOUGH for run in tables)
         causes = (
