@@ -68,6 +68,13 @@ def test_the_rows_are_those_of_all_that_could_be_chosen(seed):
     assert found.sigma**2 == pytest.approx(left(best) / 9)
 
 
+def test_where_nothing_is_determined_no_row_is_looked_for():
+    """As of an estimate that is refused, with numbers of any size."""
+    r = np.arange(12.0)[:, None]
+    assert few_rows(r, np.zeros((12, 1, 2))) is None
+    assert few_rows(r, np.full((12, 1, 2), np.inf)) is None
+
+
 def test_a_reading_that_is_rounded_speaks_against_no_row():
     """Integers on a line of slope one, three of twelve a step off: that is rounding."""
     x = np.arange(12.0)

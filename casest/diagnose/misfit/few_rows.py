@@ -42,10 +42,12 @@ def few_rows(residual: Array, slopes: Array, rounding: float = 0.0) -> FewRows |
     most = min(MOST_ROWS, int(SHARE * rows))
     flat = slopes.reshape(residual.size, -1)
     length = np.maximum(np.linalg.norm(flat, axis=0), 1e-300)
+    if rows < FEWEST or not np.isfinite(length).all():
+        return None
     U, size, _ = np.linalg.svd(flat / length, full_matrices=False)
     Q = U[:, size > 1e-12 * size.max(initial=0.0)].reshape(rows, axes, -1)
     freedom = residual.size - Q.shape[2]
-    if rows < FEWEST or freedom < 1:
+    if not Q.size or freedom < 1:  # of an estimate that is refused nothing may be determined
         return None
     least = float(_left(residual, Q, np.arange(rows)[None])[1][0])
     whole, best = least, None

@@ -72,7 +72,7 @@ def _far_rows(problem: Problem, residuals: Sequence[Array]) -> list[str]:
     squares = np.concatenate([np.sum(r**2, axis=1) for r in residuals])
     far = squares > (LEVELS.beyond * robust_scale(residuals)) ** 2
     share = float(squares[far].sum() / max(squares.sum(), 1e-300))
-    if not 0 < np.mean(far) <= FAULTS or share <= LEVELS.most:
+    if not 0 < np.mean(far) <= FAULTS or not share > LEVELS.most:
         return []
     worst = int(np.argmax(squares))
     names = [f"row {k} of {run.name}" for run in problem.runs for k in run.rows]
