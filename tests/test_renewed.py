@@ -114,6 +114,20 @@ def test_rows_that_repeat_all_of_the_row_before_are_written_again(tmp_path):
     assert f"{np.sum(~new)} repeat all that is recorded of the row before" in said
 
 
+def test_a_row_of_which_one_number_is_new_was_read(tmp_path):
+    """A plate that is slower than the log, and beside it a reading of another pace; a row's number
+    is no reading."""
+    rng = np.random.default_rng(6)
+    columns, new = two_loops(rng)
+    counted = {**columns, "row": np.arange(3000.0)}
+    (run,) = load_runs([written(tmp_path / "counted.csv", counted)], SIGNALS)
+    np.testing.assert_array_equal(run.rows, np.flatnonzero(new))
+    for name in ("reading", "beside"):
+        other = {**columns, name: rng.standard_normal(3000)}
+        (run,) = load_runs([written(tmp_path / f"{name}.csv", other)], SIGNALS)
+        assert len(run) == 3000
+
+
 def test_columns_that_stay_each_at_times_of_its_own_are_read(tmp_path):
     columns, _ = two_loops(np.random.default_rng(7), rounded=True)
     (run,) = load_runs([written(tmp_path / "log.csv", columns)], SIGNALS)

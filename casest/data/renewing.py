@@ -67,17 +67,19 @@ def renewed_every(values: Array) -> int:
 
 
 def whole_rows_again(columns: Iterable[Array]) -> NDArray[np.bool_] | None:
-    """Which rows (N,) only repeat all numbers of the one before, as where two loops of a logger go
-    at paces of their own; None where rows do not, or where each column has repeats of its own."""
-    repeats = [np.concatenate([[False], c[1:] == c[:-1]]) for c in columns]
+    """Which rows (N,) only repeat all numbers of the one before but what counts them, as where two
+    loops of a logger go at paces of their own; None where rows do not, where each column has
+    repeats of its own, or where any is new in every row: that was read."""
+    numbers = [c for c in columns if len(c) > 1 and not np.all(c[1:] > c[:-1])]
+    repeats = np.array([np.concatenate([[False], c[1:] == c[:-1]]) for c in numbers])
     low, high = REPEATS
-    own = np.array([r for r in repeats if r.size and low < np.mean(r) < high])
+    own = repeats[[low < share < high for share in repeats.mean(axis=1)]] if numbers else repeats
     if len(own) < COLUMNS:
         return None
-    again = np.asarray(own.all(axis=0), np.bool_)
-    between = np.diff(np.flatnonzero(~again))
+    again = np.asarray(repeats.all(axis=0), np.bool_)
     if again.sum() < max(ENOUGH, TOGETHER * float(np.median(own.sum(axis=1)))):
         return None
+    between = np.diff(np.flatnonzero(~again))
     stays = np.quantile(between, 0.99) > LONGER * np.median(between)
     return None if stays else again
 

@@ -100,15 +100,15 @@ def beyond_their_ends(closing: Closing) -> Iterator[str]:
     model, values = closing.after.model, closing.after.values
     for attached in (a for a in model.effects if a.label in added):
         ends = [n for n, kind in attached.effect.profile if kind in ("band", "threshold")]
-        widths = [values[f"{attached.label}.{n}"] for n in ends]
+        width = values.get(f"{attached.label}.{ends[0]}") if ends else None
         less = replace(model, effects=tuple(a for a in model.effects if a is not attached))
         place = less.along.quantities.get(attached.on)
-        if not widths or place is None or np.min(widths[0]) <= 0:
+        if width is None or place is None or np.min(width) <= 0:
             continue
         problem = Problem(less, prepared(less, closing.after.problem.runs))
         point = problem.point(less.among(values))
         met = [found[0][:, :, 0] for found in problem.evaluate(point, {"q": place.value})]
-        every, width = np.concatenate(met), widths[0]
+        every = np.concatenate(met)
         if np.all(every > width) or np.all(every < -width):
             size = ", ".join(f"{w:.4g}" for w in np.atleast_1d(width))
             yield (
