@@ -781,6 +781,16 @@ def test_rows_that_a_log_has_in_another_order_are_put_in_that_of_time(
         assert any(said in note for note in run.notes)
 
 
+def test_a_row_that_came_late_is_named_as_in_its_file(tmp_path: Path) -> None:
+    """There is another run before."""
+    rows = [f"a,{t},1,2,3\n" for t in range(20)]
+    rows += [f"b,{t},{t},2,3\n" for t in (0, 1, 2, 4, 3, *range(5, 12))]
+    (tmp_path / "log.csv").write_text("run,t,vx,vy,vz\n" + "".join(rows))
+    _, late = load_runs([str(tmp_path / "log.csv")], [Signal("v", 3, None)])
+    assert any("1 row came late, the first row 24" in note for note in late.notes)
+    np.testing.assert_array_equal(late.rows, [20, 21, 22, 24, 23, *range(25, 32)])
+
+
 def test_rows_of_one_stamp_of_a_coarse_clock_are_spread_over_its_step(tmp_path: Path) -> None:
     """250 rows at 2.5 Hz, by a clock of whole seconds: each is off by less than one."""
     true = np.arange(250) / 2.5

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casest import units as unit_names
-from casest.data import checks, timing
+from casest.data import checks, stamps, timing
 from casest.data.converting import numbers, rotation, vector
 from casest.data.finding import Choice, also_missing, as_names, find_column, find_columns
 from casest.data.frames import is_frame
@@ -431,7 +431,7 @@ def _in_time(bound: _Bound, rows: NDArray[np.int_]) -> tuple[NDArray[np.int_], l
     if bound.time is None:
         return rows, []
     there = rows[np.isfinite(bound.time[rows])]
-    found = timing.in_order(bound.time[there])
+    found = stamps.in_order(bound.time[there], there)
     if found is None:
         return rows, []
     order, why = found
@@ -471,11 +471,11 @@ def _from_column(
     time, name = bound.time[rows], " and ".join(bound.time_source)
     there = np.isfinite(time)
     try:
-        timing.refuse_unordered(table.file, name, time[there], rows[there])
+        stamps.refuse_unordered(table.file, name, time[there], rows[there])
     except DataError as error:
         if needed:
             raise
-        found = timing.within_stamps(time[there])
+        found = stamps.within_stamps(time[there])
         if found is None:
             return None, [f"{timing.UNUSED}{error}"]
         spread, why = found

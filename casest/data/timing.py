@@ -19,9 +19,7 @@ Array = NDArray[np.float64]
 
 GAP = 5.0  # times the usual step
 USUAL = 0.8  # share of the steps that do not exceed it
-_BACK = 0.1  # share of steps back from which on a column is no time, and of none where it is coarse
-_LATE = 20  # places by which a row that comes late may be off
-_LOG = 100  # rows from which on those of one stamp are a log's, no repeats of a table
+_BACK = 0.1  # share of steps back from which on a column is no time
 _EVEN = 20  # steps that show whether a record is evenly sampled
 
 #: What a note says of a time without a unit.
@@ -216,7 +214,7 @@ def interruptions(name: str, time: Array, rows: NDArray[np.int_]) -> list[str]:
         count = int((np.rint(steps[lost] / median) - 1).sum())
         coarse = ", or the time stamps are coarse" if lost.size > 0.1 * len(steps) else ""
         said.append(
-            f"{_counted(count, 'sample')} missing in {_counted(lost.size, 'place')}, the first "
+            f"{counted(count, 'sample')} missing in {counted(lost.size, 'place')}, the first "
             f"behind row {rows[lost[0]]} (t = {time[lost[0]]:.6g} s){coarse}"
         )
     found = np.flatnonzero(wide)
@@ -224,13 +222,14 @@ def interruptions(name: str, time: Array, rows: NDArray[np.int_]) -> list[str]:
         worst = found[np.argmax(steps[found])]
         samples = f" ({round(steps[worst] / median) - 1} samples)" if even else ""
         said.append(
-            f"{_counted(found.size, 'gap')}, the longest {steps[worst]:.4g} s{samples} behind "
+            f"{counted(found.size, 'gap')}, the longest {steps[worst]:.4g} s{samples} behind "
             f"row {rows[worst]} (t = {time[worst]:.6g} s)"
         )
     return [f"{name}: {'; '.join(said)}; the median step is {median:.3g} s"] if said else []
 
 
-def _counted(n: int, thing: str) -> str:
+def counted(n: int, thing: str) -> str:
+    """`1 row`, `2 rows`."""
     return f"{n} {thing}" if n == 1 else f"{n} {thing}s"
 
 
@@ -250,63 +249,6 @@ def checked_rate(rate: float) -> float:
     if not (np.isfinite(rate) and rate > 0):
         raise UsageError(f"rate {rate} Hz makes no sense; give samples per second, for example 100")
     return float(rate)
-
-
-def in_order(time: Array) -> tuple[NDArray[np.int_], str] | None:
-    """How rows follow each other where a log begins with its end, wraps, or has some that come
-    late, and what to say of that.
-
-    time (N,), s. None where there is nothing to do, or no telling: where it starts again, the parts
-    are records of their own, and a stamp far from its neighbours' is wrong.
-    """
-    back = np.flatnonzero(~(np.diff(time) > 0)) + 1
-    if not back.size:
-        return None
-    order = np.argsort(time, kind="stable")
-    if not (np.diff(time[order]) > 0).all():
-        return None
-    if back.size == len(time) - 1:
-        return order, "the newest row comes first"
-    if back.size == 1 and time[-1] < time[0]:
-        return order, f"the log wraps: it begins at row {back[0]}, behind which it was overwritten"
-    away = np.abs(order - np.arange(len(order)))
-    if away.max() > _LATE or np.mean(time < np.maximum.accumulate(time)) > _BACK:
-        return None
-    late = int(np.sum(time < np.maximum.accumulate(time)))
-    return order, f"{_counted(late, 'row')} came late, the first row {back[0]}"
-
-
-def within_stamps(time: Array) -> tuple[Array, str] | None:
-    """Times (N,), s, of rows that a coarse clock gave one stamp, evenly over its step, and what to
-    say of that; None where stamps go back, or where the clock is fine and a row is there twice."""
-    steps = np.diff(time)
-    again = steps == 0
-    if len(time) < _LOG or np.mean(again) < _BACK or (steps < 0).any() or again.all():
-        return None
-    tick, usual = float(steps[~again].min()), float(np.median(steps[~again]))
-    if tick < 0.5 * usual:
-        return None
-    _, first, count = np.unique(time, return_index=True, return_counts=True)
-    place = np.arange(len(time)) - np.repeat(first, count)
-    spread = time + tick * place / np.repeat(count, count)
-    shared = int(count[count > 1].sum())
-    return spread, (
-        f"its stamps are {tick:.6g} s apart, and {shared} of {len(time)} rows share one: these are "
-        "taken as evenly spaced over it"
-    )
-
-
-def refuse_unordered(file: str, column: str, time: Array, rows: NDArray[np.int_]) -> None:
-    """Raise DataError at the first row whose time does not exceed the one before."""
-    wrong = np.flatnonzero(np.diff(time) <= 0)
-    if wrong.size:
-        at = int(wrong[0])
-        what = "repeats" if time[at + 1] == time[at] else "goes backward from"
-        raise DataError(
-            f"{file}: column {column} row {rows[at + 1]}: time {time[at + 1]:.9g} s {what} "
-            f"{time[at]:.9g} s in row {rows[at]} ({wrong.size} such rows); mark separate records "
-            f"with a column run, or give --rate HZ to count samples instead"
-        )
 
 
 def blocks(

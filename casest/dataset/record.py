@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from casest.data import checks, timing
+from casest.data import checks, stamps, timing
 from casest.data.bind import is_time, load_runs
 from casest.data.run import Run
 from casest.data.table import Table, table_of
@@ -190,7 +190,7 @@ class _Mapped:
         """Put the time, which must go on, and count the gaps."""
         if self.count:
             before = float(self.values["the time"][0, self.count - 1])
-            timing.refuse_unordered(run.file, "of the time", np.array([before, time[0]]),
+            stamps.refuse_unordered(run.file, "of the time", np.array([before, time[0]]),
                                     np.array([-1, 0]))  # fmt: skip
         else:
             before = float(time[0])
