@@ -26,7 +26,7 @@ def bath(seed, rows=1500, tau=200.0, step=5.0):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.long)])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_a_lag_of_many_samples_that_one_jump_shows_is_found(seed):
     """Before, cubic, or only "unexplained": the slope of a lag of nothing is the jump's own."""
     closing = close("linear", bath(seed))
@@ -46,8 +46,9 @@ def dyno(seed, rows=340):
     return {"reference": current, "reading": torque, "load": load}
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("seed", [0, 2, pytest.param(4, marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "seed", [2, *(pytest.param(seed, marks=pytest.mark.long) for seed in (0, 4))]
+)
 def test_what_two_rows_of_a_fault_show_is_no_influence(seed):
     closing = close("linear", dyno(seed), rate=10.0)
     assert [e.candidate.label for e in closing.effects] == ["outliers"]

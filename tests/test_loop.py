@@ -53,7 +53,6 @@ def labels(closing):
     return [f.candidate.label for f in closing.effects]
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("seed", [31, pytest.param(32, marks=pytest.mark.long)])
 def test_a_step_is_found_in_poses_that_show_their_norm_only(seed):
     """The residual of a norm has no axes: where it jumps, cannot be seen in it directly."""
