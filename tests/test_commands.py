@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from casest import calibrate, close
-from casest.diagnose.noise.of_inputs import _where_held, noise_of_inputs
+from casest.diagnose.noise.of_inputs import most_where_held, noise_of_inputs
 
 TAU, GAIN = 0.26, 1.6
 
@@ -54,6 +54,6 @@ def test_noise_of_what_repeats_is_less_than_is_said(noise, step):
     rng = np.random.default_rng(5)
     course = 3 * np.sin(0.01 * np.arange(4000)) + noise * rng.standard_normal(4000)
     x = step * np.round(course / step)
-    most = _where_held(x[:, None])
+    most = most_where_held(x[:, None])
     assert noise <= most <= step
-    assert np.isinf(_where_held(x[:, None] + rng.uniform(0, 1e-6, (4000, 1))))
+    assert np.isinf(most_where_held(x[:, None] + rng.uniform(0, 1e-6, (4000, 1))))

@@ -63,10 +63,10 @@ def noise_of_inputs(
         if np.isfinite(square) and square > 0:
             size = noise * float(np.sqrt(plain.residual_count / square))
             values = of([run.signals[name] for run in plain.runs])
-            yield name, min(_white(values, spans, size), _where_held(values))
+            yield name, min(_white(values, spans, size), most_where_held(values))
 
 
-def _where_held(values: Array) -> float:
+def most_where_held(values: Array) -> float:
     """The most noise that values (N, k) may have which repeat in half of the rows: half a step of
     them, since noise of more takes a reading to another step. A command is held to its last digit.
     """
