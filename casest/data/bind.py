@@ -240,6 +240,7 @@ def _runs(
             block=timing.blocks(time, None if pose is None else pose[rows], rows - every[0]),
             count=np.ones(len(rows), dtype=np.int_),
             spread={},
+            called=bound.sources,
             notes=(*table.notes, *bound.notes, *dropped, *notes, *order_notes, *time_notes),
         )
         varying = [s for s in signals if s.name not in options.steady]

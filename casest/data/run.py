@@ -62,6 +62,7 @@ class Run:
     elsewhere: signals and columns that come from another file than the first, as they are there.
     whole: the record that these samples were taken from, where `places` (N,) says; None of a whole.
     averaged: the raw record whose rests the samples are; None of any other.
+    called: per signal the columns of its file that it was read from, where that is known.
     """
 
     name: str
@@ -82,6 +83,7 @@ class Run:
     whole: Run | None = None
     places: Index | None = None
     averaged: Averaged | None = None
+    called: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     #: Signals between their samples, once they were asked for; of a changed run they are others.
     curves: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 

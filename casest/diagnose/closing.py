@@ -40,6 +40,8 @@ class Closing:
     undecided: Undecided | None = None
     #: What a slow course in the residual looks like, though its cause is not known.
     described: tuple[Course, ...] = ()
+    #: Of what is left, as a share, that averages of inputs over the rows around take away.
+    averaged: float = 0.0
 
     @cached_property
     def misfit(self) -> Misfit:

@@ -30,6 +30,7 @@ from casest.diagnose.sensor.courses import courses
 from casest.diagnose.sensor.final import certified, left_in
 from casest.diagnose.sensor.foretelling import foretelling, on_the_same_samples
 from casest.diagnose.sensor.outliers import spoilt, without_outliers
+from casest.diagnose.sensor.to_both_sides import of_inputs
 from casest.diagnose.visibility import Visible, visible
 from casest.effects import CATALOGUE
 from casest.effects.placing import prepared
@@ -211,6 +212,7 @@ def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str],
         sensor.runs,
         _undecided(sensor, state),
         courses(sensor, state.fit, state.last) if state.last else (),
+        of_inputs(state.fit, sensor.rows),
     )
 
 

@@ -32,7 +32,7 @@ def visible(linear: Linear, trials: Sequence[Trial]) -> tuple[Visible, ...]:
     """Of every trial, by least squares weighted with the noise's spectrum."""
     likelihood = Likelihood(linear)
     root = 1 / np.sqrt(likelihood.beside().spectrum)[:, None]
-    J = likelihood.by_frequency(linear.slopes) * root
+    J = likelihood.by_frequency(linear.beside) * root
     size = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
     A = np.linalg.pinv((J / size).T @ (J / size), rcond=1e-10, hermitian=True)
     return tuple(_of(t, J / size, size, A, likelihood, root) for t in trials)

@@ -252,13 +252,9 @@ def _of_tables(problem: Problem, point: Point) -> Iterator[str]:
     tables = [run for run in problem.runs if not is_series(run)]
     over = correlation_time(problem, point, tables=ENOUGH_ALIKE) if tables else 1.0
     if over > 1:
-        timed = any(run.time is not None or len(run) < ENOUGH for run in tables)
-        causes = (
-            f"in fewer than {ENOUGH} rows"
-            if timed
-            else "in rows without a time; if they followed each other, say so with --rate"
-        )
+        unknown = any(run.time is None and len(run) >= ENOUGH for run in tables)
+        rate = "; if they followed each other, say so with --rate" if unknown else ""
         yield (
             f"residuals of neighbouring rows are alike (over {over:.2g} rows): standard deviations "
-            f"allow for that, causes do not {causes}"
+            f"and causes allow for that{rate}"
         )

@@ -22,7 +22,8 @@ from casest.leastsquares.problem import Point, Problem
 class Scatter:
     """Scatter between runs over that expected from the noise within them (F), and what sticks out.
 
-    `worst` names the unknown and the run that differ most, by `away` standard deviations.
+    `worst` names the unknown and the run that differ most, by `away` standard deviations; `share`:
+    of all squares, that runs would take away which had values of their own.
     """
 
     F: float
@@ -30,6 +31,7 @@ class Scatter:
     p_value: float
     worst: str
     away: float
+    share: float
 
 
 def between_runs(problem: Problem, point: Point, correlated_over: float = 1.0) -> Scatter | None:
@@ -59,7 +61,7 @@ def between_runs(problem: Problem, point: Point, correlated_over: float = 1.0) -
     F = gains / extra / variance / correlated_over
     freedom = float(extra), left / correlated_over
     worst, away = _worst(problem, steps, shared, float(np.sqrt(variance * correlated_over)))
-    return Scatter(F, freedom, _tail(F, *freedom), worst, away)
+    return Scatter(F, freedom, _tail(F, *freedom), worst, away, gains / (gains + within))
 
 
 def _worst(

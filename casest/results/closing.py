@@ -18,7 +18,12 @@ from casest.declaration.effect import Attached
 from casest.declaration.shapes import Array
 from casest.diagnose.closing import Closing
 from casest.diagnose.cross_validation import rms
-from casest.diagnose.detectability import beyond_their_ends, detectable, invisible
+from casest.diagnose.detectability import (
+    beyond_their_ends,
+    detectable,
+    invisible,
+    noise_of_inputs_in,
+)
 from casest.diagnose.formula.terms import source
 from casest.diagnose.found import Found
 from casest.diagnose.levels import LEVELS
@@ -182,7 +187,7 @@ def closing_result(
     before, after = held_out or (closing.before_held_out, closing.after_held_out)
     fitted = _section(closing.after, closing, after)
     shared["noise"] = NoiseModel(**asdict(shared["noise"]), **left.noise)
-    shared["notes"] += beyond_their_ends(closing)
+    shared["notes"] += [*beyond_their_ends(closing), *noise_of_inputs_in(closing)]
     if held_out and (once := happened_once(closing.after)):
         shared["notes"].append(f"{', '.join(once)}: {ALONE}")
     return Closed(

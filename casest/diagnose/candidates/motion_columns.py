@@ -28,7 +28,10 @@ def columns_of_motion(model: Model, runs: Sequence[Run]) -> frozenset[str]:
     """Columns of the motion, where the model's sensor is one that is moved. `runs` are prepared."""
     run = runs[0]
     moved = any(
-        s.kind == "rotation" or _is_motion("", run.units.get(s.name)) for s in model.signals
+        s.kind == "rotation"
+        or _is_motion("", run.units.get(s.name))
+        or any(_CALLED.search(name) for name in run.called.get(s.name, ()))
+        for s in model.signals
     )
     if not moved and not any(s.size == 3 for s in model.signals):
         return frozenset()

@@ -31,18 +31,41 @@ def chance_by_row(before: Linear, after: Linear, *, together: bool = False) -> f
     """
     from scipy.special import fdtrc
 
-    rows, axes = before.residual.shape
-    q = after.basis.shape[1] - before.basis.shape[1]
-    rest = rows * axes - after.basis.shape[1]
+    q, rest = _freedom(before, after)
     if rest < 1 or q < 1:
         return 1.0
-    beyond = after.basis - before.basis @ (before.basis.T @ after.basis)
-    C = np.linalg.svd(beyond, full_matrices=False)[0][:, :q]
+    C = _beyond(before, after)
     added = C.T @ (before.residual - after.residual).ravel()
     moved = _by_each_row(after, C)
     F = float(added @ np.linalg.lstsq(moved.T @ moved, added, rcond=None)[0]) / q
-    larger = _by_neighbours(C, rows, kinship(after)) if together else 1.0
+    larger = _by_neighbours(C, len(after.residual), kinship(after)) if together else 1.0
     return float(fdtrc(q, rest, F / larger))
+
+
+def chance_together(before: Linear, after: Linear) -> float:
+    """That of the classical F test, with what neighbours that are alike make of the variance."""
+    from scipy.special import fdtrc
+
+    q, rest = _freedom(before, after)
+    left, fall = (float(np.sum(r**2)) for r in (after.residual, before.residual))
+    if rest < 1 or q < 1 or not left > 0:
+        return 1.0 if left > 0 else 0.0
+    F = max(fall - left, 0.0) / q / (left / rest)
+    larger = _by_neighbours(_beyond(before, after), len(after.residual), kinship(after))
+    return float(fdtrc(q, rest, F / larger))
+
+
+def _freedom(before: Linear, after: Linear) -> tuple[int, int]:
+    """Unknowns that a refit adds, and residuals that are left over."""
+    count = after.basis.shape[1]
+    return count - before.basis.shape[1], after.residual.size - count
+
+
+def _beyond(before: Linear, after: Linear) -> Array:
+    """Orthonormal columns (N·m, q) of what a refit's unknowns add."""
+    beyond = after.basis - before.basis @ (before.basis.T @ after.basis)
+    q, _ = _freedom(before, after)
+    return np.asarray(np.linalg.svd(beyond, full_matrices=False)[0][:, :q])
 
 
 def _by_each_row(linear: Linear, C: Array) -> Array:
@@ -63,9 +86,12 @@ def _by_each_row(linear: Linear, C: Array) -> Array:
 def _by_neighbours(C: Array, rows: int, rho: float) -> float:
     """By which the variance of coefficients of columns C (N·m, q) is larger than that of errors
     each for itself."""
-    columns, apart = C.reshape(rows, -1), np.arange(rows)
-    kin = np.power(rho, np.abs(apart[:, None] - apart[None, :]))
-    return max(1.0, float(np.sum(columns * (kin @ columns)) / C.shape[1]))
+    from scipy.signal import lfilter
+
+    columns = C.reshape(rows, -1)
+    before, after = (lfilter([1.0], [1.0, -rho], c, axis=0) for c in (columns, columns[::-1]))
+    alike = before + after[::-1] - columns  # Σ ρ^|i − j| of all rows
+    return max(1.0, float(np.sum(columns * alike) / C.shape[1]))
 
 
 def kinship(linear: Linear) -> float:

@@ -119,8 +119,8 @@ class Held:
         own = np.zeros((N, m, self._count, m))
         for axis in range(m):
             own[np.arange(N), axis, self._number, axis] = self.linear.root[:, axis]
-        slopes = np.concatenate([self.linear.slopes, own.reshape(N, m, -1)], axis=2)
-        return _beside_none(replace(self.linear, slopes=slopes))
+        slopes = np.concatenate([self.linear.beside, own.reshape(N, m, -1)], axis=2)
+        return _beside_none(replace(self.linear, slopes=slopes, feigned=None))
 
     @cached_property
     def _between(self) -> tuple[Likelihood, Explained]:

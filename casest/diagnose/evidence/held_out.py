@@ -39,6 +39,12 @@ def foretold(linear: Linear, columns: Sequence[Array], parts: Index) -> Array:
     return found
 
 
+def share_taken(linear: Linear, column: Array) -> float:
+    """Share of held-out squares that a column (N, m) takes away, from piece to piece; else 0."""
+    seen = fall(linear, [column[:, :, None]], linear.parts.pieces)
+    return max(0.0, 1 - seen.ratio) if seen.t > LEVELS.confirmed else 0.0
+
+
 def _rows(linear: Linear, parts: Index) -> list[Index]:
     """Of all residuals those of each part."""
     row = np.repeat(parts, linear.residual.shape[1])

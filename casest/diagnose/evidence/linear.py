@@ -48,7 +48,9 @@ class Linear:
     `spans` are stretches of evenly spaced rows: their noise may have a colour. Without any, rows
     are poses, or of a table, and their noise is white. `least`: share of a cause's length that must
     survive beside the unknowns. `plateaus`: the number of each row's (N,), where inputs are held.
-    `roots` (N, m): what rows are multiplied by, the root of their weights; None: by one.
+    `roots` (N, m): what rows are multiplied by, the root of their weights; None: by one. `feigned`
+    (N, m, k): what noise of the inputs makes of the residuals, which a cause must explain more
+    than; None: nothing.
     """
 
     residual: Array
@@ -58,6 +60,14 @@ class Linear:
     least: float = LEVELS.survives
     plateaus: Index | None = None
     roots: Array | None = None
+    feigned: Array | None = None
+
+    @property
+    def beside(self) -> Array:
+        """Slopes (N, m, p + k), and what noise of the inputs makes."""
+        if self.feigned is None:
+            return self.slopes
+        return np.concatenate([self.slopes, self.feigned], axis=2)
 
     @property
     def root(self) -> Array:
@@ -86,8 +96,8 @@ class Linear:
 
     @cached_property
     def basis(self) -> Array:
-        """Orthonormal (N·m, p) of what the unknowns do to the residuals."""
-        flat = self.slopes.reshape(self.residual.size, -1)
+        """Orthonormal (N·m, p) of what the unknowns and noise of the inputs do to the residuals."""
+        flat = self.beside.reshape(self.residual.size, -1)
         size = np.linalg.norm(flat, axis=0)
         alive = size > 0
         if not alive.any():
@@ -99,7 +109,8 @@ class Linear:
     def evened(self, size: Array) -> Linear:
         """The problem in the sizes (N,) that the noise has at each row."""
         r, J = self.residual / size[:, None], self.slopes / size[:, None, None]
-        return replace(self, residual=r, slopes=J, roots=self.root / size[:, None])
+        noise = None if self.feigned is None else self.feigned / size[:, None, None]
+        return replace(self, residual=r, slopes=J, roots=self.root / size[:, None], feigned=noise)
 
     def without(self, columns: Array, part: Array) -> Linear:
         """The problem as if some unknowns were not there: `columns` (N, m, p − k) are the slopes of
@@ -120,9 +131,13 @@ def alike(fits: Sequence[Linear]) -> list[Linear]:
 def _less(fit: Linear, gone: NDArray[np.bool_]) -> Linear:
     if not gone.any():
         return fit
-    residual, slopes = fit.residual.copy(), fit.slopes.copy()
-    residual[gone], slopes[gone] = 0.0, 0.0
-    return replace(fit, residual=residual, slopes=slopes)
+    parts = [None if x is None else x.copy() for x in (fit.residual, fit.slopes, fit.feigned)]
+    for part in (x for x in parts if x is not None):
+        part[gone] = 0.0
+    residual, slopes, feigned = parts
+    assert residual is not None
+    assert slopes is not None
+    return replace(fit, residual=residual, slopes=slopes, feigned=feigned)
 
 
 def robust_sd(residual: Array) -> Array:

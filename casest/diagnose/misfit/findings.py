@@ -52,13 +52,14 @@ FAULTS = 0.1
 
 @dataclass(frozen=True)
 class Finding:
-    """Evidence of a misfit: where, in words, σ of the noise beside it, its share if known; `slow`:
-    it is a course of unknown cause; `rows`: the few that it is in, in words."""
+    """Evidence of a misfit: where, in words; its share of the squares, or else σ of the noise
+    beside it; `slow`: it is a course of unknown cause; `rows`: the few that it is in, in words.
+    """
 
     where: str
     p_value: float
-    sigma: float
     share: float = 0.0
+    sigma: float = np.inf
     slow: bool = False
     rows: str = ""
 
@@ -81,13 +82,14 @@ def findings(
     found += in_few_rows(problem, point) + _far_out(problem, sigma)
     found += _repeats(problem, point, clipped, wanders=wanders)
     slow = [] if wanders else _slow(problem, point, clipped, sigma)
-    follows = _follows(problem, point, clipped, sigma, in_time=not (slow or wanders))
+    follows = _follows(problem, point, clipped, in_time=not (slow or wanders))
     found += follows + slow
     line = strongest_line(problem.runs, clipped)
     if line is not None and line.p_value < LEVELS.misfit:
-        found.append(Finding(f"a line at {line.frequency:.4g} {line.unit}", line.p_value, sigma))
+        where = f"a line at {line.frequency:.4g} {line.unit}"
+        found.append(Finding(where, line.p_value, line.share))
     if not any(f.slow for f in found):
-        found += _runs(problem, point, correlated_over, sigma)
+        found += _runs(problem, point, correlated_over)
     return found
 
 
@@ -113,7 +115,7 @@ def _repeats(
     where += "within them explains"
     if ratio > REPEATED:
         where = f"between {tested.between}: within them readings only repeat, and explain nothing"
-    return [Finding(where, tested.p_value, tested.sigma)]
+    return [Finding(where, tested.p_value, sigma=tested.sigma)]
 
 
 def _far_out(problem: Problem, sigma: float) -> list[Finding]:
@@ -124,7 +126,7 @@ def _far_out(problem: Problem, sigma: float) -> list[Finding]:
     if share <= FAULTS:
         return []
     where = f"{100 * share:.0f} % of the rows are far out: too many to be faults"
-    return [Finding(where, 0.0, sigma)]
+    return [Finding(where, 0.0, sigma=sigma)]
 
 
 def in_few_rows(problem: Problem, point: Point) -> list[Finding]:
@@ -139,7 +141,7 @@ def in_few_rows(problem: Problem, point: Point) -> list[Finding]:
         return []
     listed = " and ".join(_named(runs, found.rows))
     where = f"{100 * found.share:.0f} % of it is in {listed}, which the others speak against"
-    return [Finding(where, found.p_value, found.sigma, found.share, rows=listed)]
+    return [Finding(where, found.p_value, found.share, rows=listed)]
 
 
 def _named(runs: Sequence[Run], rows: NDArray[np.int_]) -> list[str]:
@@ -170,7 +172,7 @@ def _before(problem: Problem, point: Point) -> list[Finding]:
     found, scale = against_prior(problem, point), problem.noise_scale
     if found is None or scale is None or found.agrees:
         return []
-    return [Finding(found.words, found.chi_square.larger, scale)]
+    return [Finding(found.words, found.chi_square.larger, sigma=scale)]
 
 
 def _stated(problem: Problem, point: Point) -> list[Finding]:
@@ -182,7 +184,7 @@ def _stated(problem: Problem, point: Point) -> list[Finding]:
         f"chi-square is {found.value:.4g} with {found.degrees_of_freedom} degrees of freedom: the "
         f"residual is {found.times:.2g} times the stated noise"
     )
-    return [Finding(where, found.larger, scale)]
+    return [Finding(where, found.larger, sigma=scale)]
 
 
 def _slow(problem: Problem, point: Point, clipped: Sequence[Array], sigma: float) -> list[Finding]:
@@ -207,8 +209,7 @@ def _slow(problem: Problem, point: Point, clipped: Sequence[Array], sigma: float
         f"{100 * found.share:.0f} % of {it} is a slow course over about {found.samples} samples"
         f"{_when(problem, clipped, found.samples)}, of unknown cause"
     )
-    left = sigma * float(np.sqrt(1 - min(found.share, 1)))
-    return [Finding(where, found.p_value, left, found.share, slow=True)]
+    return [Finding(where, found.p_value, found.share, slow=True)]
 
 
 def _when(problem: Problem, clipped: Sequence[Array], samples: int) -> str:
@@ -243,7 +244,6 @@ def _follows(
     problem: Problem,
     point: Point,
     clipped: Sequence[Array],
-    sigma: float,
     *,
     in_time: bool,
 ) -> list[Finding]:
@@ -278,8 +278,7 @@ def _follows(
     most = (1 - LEVELS.alike) * max(s.share for s in found)
     best = max(found, key=lambda s: (s.share > most and s.name not in clocks, s.share))
     where = f"{100 * best.share:.0f} % of it follows {best.name}"
-    left = sigma * float(np.sqrt(1 - min(best.share, 1)))
-    return [Finding(where, best.p_value, left, best.share)]
+    return [Finding(where, best.p_value, best.share)]
 
 
 def _taken(problem: Problem, point: Point) -> Array:
@@ -289,12 +288,12 @@ def _taken(problem: Problem, point: Point) -> Array:
     return np.asarray(U[:, s > 1e-9 * s.max(initial=0.0)])
 
 
-def _runs(problem: Problem, point: Point, correlated_over: float, sigma: float) -> list[Finding]:
+def _runs(problem: Problem, point: Point, correlated_over: float) -> list[Finding]:
     scatter = between_runs(problem, point, correlated_over)
     if scatter is None or scatter.p_value >= LEVELS.misfit:
         return []
     where = f"between runs: {scatter.worst} is {scatter.away:.0f} standard deviations off"
-    return [Finding(where, scatter.p_value, sigma)]
+    return [Finding(where, scatter.p_value, scatter.share)]
 
 
 def shared_by_neighbours(found: Scatter) -> list[Finding]:
@@ -311,4 +310,4 @@ def shared_by_neighbours(found: Scatter) -> list[Finding]:
         "differs by between rows with nearly the same inputs"
     )
     share = 1 - found.left / found.residual
-    return [Finding(where, chance, float(np.sqrt(found.left)), share)]
+    return [Finding(where, chance, share)]

@@ -129,7 +129,8 @@ def left_over(
     if everything.size:
         everything = everything[np.abs(everything) <= LEVELS.beyond * robust_scale([everything])]
     variance = float(np.mean(everything**2)) if everything.size else np.nan
-    sigma = min((f.sigma for f in found), default=np.sqrt(variance))
+    # What has no share of its own: all that is more than the noise beside it.
+    sigma = min((f.sigma for f in found if not f.share), default=np.sqrt(variance))
     fraction = max(0.0, 1 - sigma**2 / variance) if variance > 0 else 0.0
     fraction = max([fraction, *(f.share for f in found)])
     where = [f.where for f in found[:3]]

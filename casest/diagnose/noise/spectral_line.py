@@ -6,7 +6,7 @@ The neighbourhood is the noise's own colour, so that only what is narrow counts.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,11 +24,13 @@ UNEVEN = "cycles per sample (the stamps of time are uneven)"
 
 @dataclass(frozen=True)
 class Line:
-    """The strongest line: frequency (Hz; per sample where time is uneven), p-value over all."""
+    """The strongest line: frequency (Hz; per sample where time is uneven), p-value over all, its
+    share of the squares."""
 
     frequency: float
     unit: str
     p_value: float
+    share: float
 
 
 def strongest_line(runs: Sequence[Run], residuals: Sequence[Array]) -> Line | None:
@@ -39,7 +41,7 @@ def strongest_line(runs: Sequence[Run], residuals: Sequence[Array]) -> Line | No
     if not found:
         return None
     best = min(found, key=lambda line: line.p_value)
-    return Line(best.frequency, best.unit, min(1.0, best.p_value * len(found)))
+    return replace(best, p_value=min(1.0, best.p_value * len(found)))
 
 
 def _line(run: Run, r: Array) -> Line | None:
@@ -58,12 +60,12 @@ def _line(run: Run, r: Array) -> Line | None:
     even = np.zeros((length, r.shape[1]))
     even[place] = r
     power = np.sum(np.abs(np.fft.rfft(even, axis=0)) ** 2, axis=1)[1:-1]
-    p, k = _most_significant(power, r.shape[1])
-    return Line((k + 1) / (length * step), unit, p)
+    p, k, share = _most_significant(power, r.shape[1])
+    return Line((k + 1) / (length * step), unit, p, share)
 
 
-def _most_significant(power: Array, axes: int) -> tuple[float, int]:
-    """Bonferroni's p-value and the place of the line that stands out most.
+def _most_significant(power: Array, axes: int) -> tuple[float, int, float]:
+    """Bonferroni's p-value, the place of the line that stands out most, and its share.
 
     The level is the mean of as many frequencies on the left as on the right: slopes cancel.
     """
@@ -72,7 +74,7 @@ def _most_significant(power: Array, axes: int) -> tuple[float, int]:
     n = len(power)
     k = np.arange(MIDDLE, n - MIDDLE)
     if not len(k):
-        return 1.0, 0
+        return 1.0, 0, 0.0
     width = np.minimum(WIDE, np.minimum(k, n - 1 - k))
     total = np.concatenate([[0.0], np.cumsum(power)])
     around = total[k + width + 1] - total[k - width]
@@ -81,4 +83,5 @@ def _most_significant(power: Array, axes: int) -> tuple[float, int]:
     level = (around - inner) / count
     p = fdtrc(2 * axes, 2 * axes * count, power[k] / level)
     best = int(np.argmin(p))
-    return min(1.0, float(p[best]) * len(k)), int(k[best])
+    share = (inner[best] - (2 * NEXT + 1) * level[best]) / max(float(total[-1]), 1e-300)
+    return min(1.0, float(p[best]) * len(k)), int(k[best]), float(np.clip(share, 0.0, 1.0))

@@ -13,13 +13,12 @@ from casest.diagnose.evidence.likelihood import Likelihood
 from casest.diagnose.evidence.score import p_value, worth
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol.confirming import falls_of_refit
-from casest.diagnose.protocol.refits import feigned_between
+from casest.diagnose.protocol.refits import TOGETHER, feigned_between
 from casest.diagnose.protocol.state import F, Kept, State
 from casest.diagnose.protocol.subject import Subject
 
 #: Why a cause that was added goes again.
 LATER = "no longer needed beside what came later"
-TOGETHER = "neighbouring rows go together: its size is not as sure as the F test has it"
 
 
 def on_all_axes(subject: Subject[F], state: State[F], *, needed: bool) -> State[F]:
@@ -58,9 +57,9 @@ def eliminated(subject: Subject[F], state: State[F]) -> State[F]:
     """Each cause must earn its place again beside the others; the weakest goes first.
 
     Also the last one, where another has gone: of a pair each was judged beside the other. And in
-    poses, where nothing else is found, by how neighbours go together.
+    poses and tables, where nothing else is found, by how neighbours go together.
     """
-    count, poses = len(state.kept), not subject.linear(state.fit).series
+    count, poses = len(state.kept), not subject.linear(state.fit).coloured
     while len(state.kept) > 1 or (state.kept and (len(state.kept) < count or poses)):
         weak = []
         for kept in state.kept:
@@ -137,7 +136,7 @@ def _beside_the_others(
     why = LATER
     strong = score > LEVELS.strong if linear.series else chance < LEVELS.chance
     same = linear.residual.shape == whole.residual.shape
-    if strong and same and not linear.series and not subject.asked(kept.what):
+    if strong and same and not linear.coloured and not subject.asked(kept.what):
         together = chance_by_row(linear, whole, together=True)
         if together * np.exp(min(searched, 700.0)) >= LEVELS.chance:
             strong, why = False, TOGETHER

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from casest.declaration.shapes import Array
-from casest.diagnose.evidence.by_row import carried_by_few, chance_by_row
+from casest.diagnose.evidence.by_row import carried_by_few, chance_by_row, chance_together
 from casest.diagnose.evidence.input_noise import at_most, feigned_by_refit
 from casest.diagnose.evidence.linear import Linear, alike
 from casest.diagnose.evidence.rises import rise_of_squares, rises
@@ -37,6 +37,8 @@ FEIGNED = "no more of it than noise of the inputs would have (p = {:.2g})"
 NOT_HELD_OUT = "held-out data do not confirm it"
 #: Why what holds out and has strong evidence is not added.
 AS_MUCH = "a slow course of unknown cause explains as much"
+#: Why what a table shows is not, where no time says how long its rows remember.
+TOGETHER = "neighbouring rows go together: its size is not as sure as the F test has it"
 
 
 def refitted(
@@ -99,9 +101,11 @@ def _refused(evidence: Evidence, before: Linear, after: Linear) -> str:
     """Why what somebody says is there is none, by the F test of its refit; else empty."""
     if evidence.p_value >= LEVELS.chance:
         return FEIGNED.format(evidence.p_value)
-    same = before.residual.shape == after.residual.shape
-    unseen = same and falls_of_refit(before, after)["pieces"].ratio >= 1
-    return NOT_HELD_OUT if unseen else ""
+    if before.residual.shape != after.residual.shape:
+        return ""
+    if not before.coloured and chance_together(before, after) >= LEVELS.chance:
+        return TOGETHER
+    return NOT_HELD_OUT if falls_of_refit(before, after)["pieces"].ratio >= 1 else ""
 
 
 def _by_few_rows(subject: Subject[F], ranking: Ranking, evidence: Evidence, fit: F) -> str:

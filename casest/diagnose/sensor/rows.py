@@ -14,8 +14,10 @@ from casest.declaration.effect import OVER_TIME
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.slopes import rows_of
 from casest.diagnose.evidence.held_inputs import plateaus_of, settled_rows
+from casest.diagnose.evidence.held_out import share_taken
 from casest.diagnose.evidence.linear import Index, Linear, parts_of, spans_of
 from casest.diagnose.levels import LEVELS
+from casest.diagnose.noise.averages import averages, best_mean
 from casest.diagnose.noise.of_inputs import at_once
 from casest.diagnose.sensor.fits import Fit, problem_of
 from casest.diagnose.sensor.recent import Recent
@@ -39,7 +41,22 @@ class Rows:
         residual, J, roots = self.slopes(*problem_of(fit, self.runs))
         met = self.met(fit)
         parts, held = parts_of(*self._numbers, met), plateaus_of(met, self._spans)
-        return Linear(residual, J, self._spans, parts, self._least(fit), held, roots)
+        found = Linear(residual, J, self._spans, parts, self._least(fit), held, roots)
+        mean = self.best_mean(fit, found)
+        if mean is None or share_taken(found, mean) <= LEVELS.most:
+            return found
+        return replace(found, feigned=mean[:, :, None])
+
+    def best_mean(self, fit: Fit, linear: Linear) -> Array | None:
+        """What the best mean of inputs over rows before and after takes away (N, m)."""
+        if not self._spans:
+            return None
+        found = averages(*problem_of(fit, self.runs))
+        if found is None:
+            return None
+        told = linear.residual.any(axis=1) | linear.slopes.any(axis=(1, 2))
+        columns = self.of(found) * linear.root[:, :, None] * told[:, None, None]
+        return best_mean(linear.residual, replace(linear, feigned=None).basis, columns)
 
     def of(self, values: Sequence[Array]) -> Array:
         """Values of each run (N, …) in the rows that are looked at, one run after the other."""

@@ -33,6 +33,7 @@ from casest.diagnose.sensor.fits import (
 from casest.diagnose.sensor.jitter import Draw, in_refit, jittered
 from casest.diagnose.sensor.recent import Recent
 from casest.diagnose.sensor.rows import Rows
+from casest.diagnose.sensor.to_both_sides import to_both_sides
 from casest.diagnose.sensor.tried import Tried, on_axes
 from casest.diagnose.sensor.twins import bend
 from casest.diagnose.sensor.unlike import (
@@ -185,6 +186,7 @@ class Sensor(Subject[Fit]):
             or another(after.model, after.values, self.model)[1]
             or stands_in(before, after, added, self.rows)
             or driven(before, after, added, self.rows)
+            or to_both_sides(before, after, added, self.rows)
         )
         bends = [t for t in trials if bend(t.what)] if self.linear(before).series else []
         if bends and not why:
