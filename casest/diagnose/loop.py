@@ -296,7 +296,8 @@ def _undecided(sensor: Sensor, state: State[Fit]) -> Undecided | None:
             parts = {(t.family,): _share(sensor, state, [t]) for t in evidence.trials}
             shares |= {family: one for family, one in parts.items() if one is not None}
     most = LEVELS.nested * max(shares.values(), default=0.0)
-    shares = {families: share for families, share in shares.items() if share >= most}
+    several = sorted(shares.items(), key=lambda one: -one[1])
+    shares = {families: share for families, share in several if share >= most}
     names = tuple(dict.fromkeys(n for families in shares for n in families if n not in there))
     if not names:
         return None

@@ -42,12 +42,12 @@ def with_the_best(
     formulas = [] if asked else [subject.formula(state.fit, ranking)]
     described = next(iter(_without_noise(subject, state.fit, ranking, formulas)), None)
     beyond = _not_instead(ranking, _beyond_columns(ranking, options))
-    left, tried = beyond, list[Evidence]()
+    left, tried, halving = beyond, list[Evidence](), list[Evidence]()
     while True:
         held = asked or passing(ranking, left)
         state, refits = refitted(subject, state, ranking, held)
         if not asked and not tried:
-            state, more = shown(subject, state, ranking, refits)
+            state, more, halving = shown(subject, state, ranking, refits)
             refits = best_refits(refits, more, ranking.order)
             refits = _best_foretold_first(subject, state, ranking, refits)
         torn = [] if asked else torn_between(refits, ranking)
@@ -71,7 +71,7 @@ def with_the_best(
         state = state.refusing(evidence.trials[0].what, why)
     missing = [e for e in (*options, *ranking.followed) if not state.unlike(e)]
     missing.sort(key=lambda e: -e.score)
-    return replace(state, open=tuple(missing[: LEVELS.contenders]))
+    return replace(state, open=(*halving, *missing[: LEVELS.contenders]))
 
 
 def _best_foretold_first(

@@ -338,10 +338,14 @@ def _by_squares(
 
 def shown(
     subject: Subject[F], state: State[F], ranking: Ranking, beside: Sequence[Refit[F]]
-) -> tuple[State[F], list[Refit[F]]]:
+) -> tuple[State[F], list[Refit[F]], list[Evidence]]:
     """What the records show by themselves, and what takes most of the squares though it is no
-    likelier (a slow residual is likely as it is), refitted: held-out parts by the refit itself."""
-    found, there = [], {f for r in beside for f in r.evidence.families}
+    likelier (a slow residual is likely as it is), refitted: held-out parts by the refit itself.
+
+    And what leaves less than half of all that is held out, though what is slow may do so by chance.
+    """
+    found, halving = list[Refit[F]](), list[Evidence]()
+    there = {f for r in beside for f in r.evidence.families}
     most = [t for t in ranking.most if t.family not in there][: LEVELS.contenders]
     for trial in (*subject.shown(state.fit), *most):
         evidence = judged([trial], ranking.likelihood, ranking.none, families=ranking.families)
@@ -365,10 +369,14 @@ def shown(
         kept = with_chance(kept, ranking.likelihood, ranking.families)
         seen = falls_with(subject, state, ranking, kept, better)
         clear = beyond_courses(ranking, kept) and ranking.stands_out(kept)
-        if not (clear and holds_out(seen, ranking.linear)):
+        clear = clear and holds_out(seen, ranking.linear)
+        halves = all(f.ratio < LEVELS.most for f in seen.values())
+        if not (clear or halves):
             continue
         if few := _by_few_rows(subject, ranking, kept, better):
             state = state.failing(evidence, few)
-        else:
+        elif clear:
             found.append(Refit(state.fit, better, kept, seen))
-    return state, found
+        else:
+            halving.append(kept)
+    return state, found, halving
