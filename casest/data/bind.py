@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casest import units as unit_names
-from casest.data import checks, stamps, timing
+from casest.data import checks, timing
+from casest.data.clock import Clock, clock_of, is_time, time_unit, with_time
 from casest.data.converting import numbers, rotation, vector
 from casest.data.finding import Choice, also_missing, as_names, find_column, find_columns
 from casest.data.frames import is_frame
@@ -27,7 +28,7 @@ from casest.data.run import Array, Labels, Run
 from casest.data.scaling import parse_scale
 from casest.data.table import Table, read_table, table_of
 from casest.declaration.symbols import Signal
-from casest.errors import DataError, UnitError, UsageError
+from casest.errors import DataError, UsageError
 
 Path_ = str | os.PathLike[str]
 #: A table in memory: a data frame of any library, a mapping of arrays, an array.
@@ -49,8 +50,7 @@ class _Bound:
     signals: dict[str, Array]
     units: dict[str, str | None]
     sources: dict[str, tuple[str, ...]]
-    time: Array | None
-    time_source: tuple[str, ...]
+    clock: Clock
     notes: list[str]
 
 
@@ -202,8 +202,9 @@ def _runs(
     bound = _bind(table, signals, options)
     groups = {kind: _group(table, kind, options) for kind in ("run", "pose")}
     sources = {name for names in bound.sources.values() for name in names}
-    dates = {name for name in bound.time_source if table.columns[name].is_text}
-    sources |= {name for name in (*bound.time_source, *groups.values()) if name} - dates
+    clock = bound.clock
+    dates = {name for name in clock.source if table.columns[name].is_text}
+    sources |= {name for name in (*clock.source, *groups.values()) if name} - dates
     plain = {bound.sources[s.name] for s in signals if s.kind == "plain" and not is_time(s)}
     repeated = _without_repeats(bound, options)
     complete, dropped = _complete(table, bound, options, plain)
@@ -220,19 +221,16 @@ def _runs(
         notes += [f"run {label} left out: none of its rows is complete" for label in empty]
     for label in in_order:
         every = np.arange(table.n_rows) if labels is None else np.flatnonzero(labels == label)
-        every, order_notes = _in_time(bound, every)
+        every, order_notes = clock.in_order(every)
         rows = every[complete[every]]
         part = {name: values[rows] for name, values in bound.signals.items()}
-        time, time_notes = _run_time(table, bound, every, signals, options)
-        if time is not None and bound.time is not None:
-            time_notes = [*_start_said(time[complete[every]], options), *time_notes]
-        time = None if time is None else _from_zero(time[complete[every]], bound, options)
+        time, time_notes = clock.of_run(table, every, complete, signals, options)
         used = time is not None and options.rate is None  # dates that are no time are labels
         run = Run(
             name=stem if label is None else f"{stem}:{label}",
             file=table.file,
-            signals=_with_time(part, time, signals),
-            units=bound.units | _time_unit(signals),
+            signals=with_time(part, time, signals),
+            units=bound.units | time_unit(signals),
             columns={n: values[rows] for n, values in others.items() if not (n in dates and used)},
             column_units=other_units,
             time=time,
@@ -250,7 +248,7 @@ def _runs(
 
 def _bind(table: Table, signals: Sequence[Signal], options: Options) -> _Bound:
     """Find, scale and convert the columns of every signal but time."""
-    found = _Bound({}, {}, {}, None, (), [])
+    found = _Bound({}, {}, {}, Clock(), [])
     read = [signal for signal in signals if not is_time(signal)]
     for k, signal in enumerate(read):
         try:
@@ -272,7 +270,9 @@ def _bind(table: Table, signals: Sequence[Signal], options: Options) -> _Bound:
     for name in options.extra:
         column = table.columns[find_column(table, name, "the model")]
         numbers(table, column, f"column {name}", f"--columns {name}=…", gaps=True)
-    return _with_time_column(table, signals, options, found)
+    taken = {name for names in found.sources.values() for name in names}
+    clock, notes = clock_of(table, signals, options, taken)
+    return replace(found, clock=clock, notes=[*found.notes, *notes])
 
 
 def _complete(
@@ -284,8 +284,8 @@ def _complete(
     """
     needed = {name: bound.sources[name] for name in bound.signals if name not in options.gaps}
     parts = {names: bound.signals[name] for name, names in needed.items()}
-    if bound.time is not None and bound.time_source:
-        parts[bound.time_source] = bound.time[:, None]
+    if bound.clock.time is not None and bound.clock.source:
+        parts[bound.clock.source] = bound.clock.time[:, None]
     for name in options.extra:
         found = find_column(table, name, "the model")
         parts[(found,)] = np.asarray(table.columns[found].values, dtype=np.float64)[:, None]
@@ -335,7 +335,7 @@ def _slowest(
     Without a time rows in twos and threes are repeats of a table. Outputs that may be missing are
     so where they are no readings; inputs beside them are known in every row.
     """
-    if options.gaps or (bound.time is None and options.rate is None):
+    if options.gaps or (bound.clock.time is None and options.rate is None):
         return []
     sources = {bound.sources[n]: v for n, v in bound.signals.items() if bound.sources[n] in several}
     return sorted(renewed(sources), key=lambda one: -one.rows)[:1]
@@ -343,9 +343,9 @@ def _slowest(
 
 def _rows_again(table: Table, bound: _Bound, options: Options) -> NDArray[np.bool_] | None:
     """Rows of a log that are written again as a whole; of a table they are repeats."""
-    if options.gaps or (bound.time is None and options.rate is None):
+    if options.gaps or (bound.clock.time is None and options.rate is None):
         return None
-    columns = (c for name, c in table.columns.items() if name not in bound.time_source)
+    columns = (c for name, c in table.columns.items() if name not in bound.clock.source)
     return whole_rows_again(
         np.asarray(c.values, float) for c in columns if not c.is_text and c.bad is None
     )
@@ -359,162 +359,6 @@ def _without_repeats(bound: _Bound, options: Options) -> list[str]:
         values = bound.signals[outputs[one.source]]
         bound.signals[outputs[one.source]] = np.where(one.again[:, None], np.nan, values)
     return [f"of {one.again.size} rows {one}" for one in found]
-
-
-def is_time(signal: Signal) -> bool:
-    """Is a signal the time of the record?"""
-    return signal.name == "t" and signal.size == 1 and signal.kind == "plain"
-
-
-def _with_time_column(
-    table: Table, signals: Sequence[Signal], options: Options, found: _Bound
-) -> _Bound:
-    """Add the time column in s, where there is one and no rate is given."""
-    needed = any(is_time(signal) for signal in signals)
-    chosen = _chosen_time(table, options)
-    names = chosen or timing.find_time(table)
-    if not names or set(names) & {n for used in found.sources.values() for n in used}:
-        note = timing.kept_as_text(table) if not names else None
-        found.notes.extend([note] if note else [])
-        return found
-    if options.rate is not None:
-        listed = " and ".join(names)
-        found.notes.append(f"time column {listed} not used: rate {options.rate:g} Hz is given")
-        return replace(found, time_source=names)
-    try:
-        time, notes = _seconds(table, names, signals, options)
-    except (UnitError, DataError) as error:
-        if needed or chosen:
-            if isinstance(error, DataError):
-                raise
-            raise UnitError(
-                f"{table.file}: column {names[0]} as time: {error}; "
-                f"name another column with --columns t=… or say its unit with --unit t=…"
-            ) from error
-        found.notes.append(f"{timing.UNUSED}{error}")
-        return replace(found, time_source=names)
-    found.notes.extend(notes)
-    return replace(found, time=time, time_source=names)
-
-
-def _chosen_time(table: Table, options: Options) -> tuple[str, ...]:
-    """The columns that the user names as the time: one, or a date and a time of day."""
-    if "t" not in options.columns:
-        return ()
-    given = as_names(options.columns["t"])
-    names = tuple(find_column(table, name, "time") for name in given[:2])
-    if len(given) > 2 or (len(names) == 2 and not all(table.columns[n].is_text for n in names)):
-        raise DataError(
-            f"{table.file}: --columns t={','.join(given)} must name one column, or one of dates "
-            f"and one of times of day"
-        )
-    return names
-
-
-def _seconds(
-    table: Table, names: tuple[str, ...], signals: Sequence[Signal], options: Options
-) -> tuple[Array, list[str]]:
-    """The time in s, (n_rows,), and what was assumed."""
-    columns = tuple(table.columns[name] for name in names)
-    if any(column.is_text for column in columns):
-        return timing.from_text(table, columns), [f"time from {' and '.join(names)}"]
-    needed = any(is_time(signal) for signal in signals) or "t" in options.columns
-    numbers(table, columns[0], "time", "--columns t=… or --rate HZ", gaps=needed)
-    stated = timing.time_units_declared(options.units, names[0])
-    scale = options.scales.get(names[0]) or options.scales.get("t")
-    time, notes = timing.seconds(table, columns[0], stated, scale)
-    checks.refuse_too_large(table.file, "the time", names[0], time)
-    return time, notes
-
-
-def _in_time(bound: _Bound, rows: NDArray[np.int_]) -> tuple[NDArray[np.int_], list[str]]:
-    """The rows of a run as they followed each other, and a note where a file has another order."""
-    if bound.time is None:
-        return rows, []
-    there = rows[np.isfinite(bound.time[rows])]
-    found = stamps.in_order(bound.time[there], there)
-    if found is None:
-        return rows, []
-    order, why = found
-    name = " and ".join(bound.time_source)
-    return there[order], [f"{name}: {why}; rows are taken in the order of time"]
-
-
-def _run_time(
-    table: Table,
-    bound: _Bound,
-    rows: NDArray[np.int_],
-    signals: Sequence[Signal],
-    options: Options,
-) -> tuple[Array | None, list[str]]:
-    """Return the time of one run in s, (N,), and notes; None where nothing tells it."""
-    needed = any(is_time(signal) for signal in signals)
-    if bound.time is not None:
-        return _from_column(table, bound, rows, needed, options)
-    if options.rate is not None:
-        return np.arange(len(rows)) / options.rate, []
-    if stated := timing.rate_in_preamble(table):
-        entry, rate = stated
-        return np.arange(len(rows)) / rate, [f"time from the entry '{entry}': {rate:g} Hz"]
-    if needed:
-        listed = ", ".join(list(table.columns)[:12])
-        raise DataError(
-            f"{table.file}: no time column (t, time, timestamp) for signal t; the file has "
-            f"{listed}; give --rate HZ or --columns t={timing.first_increasing(table) or 'NAME'}"
-        )
-    return None, []
-
-
-def _from_column(
-    table: Table, bound: _Bound, rows: NDArray[np.int_], needed: bool, options: Options
-) -> tuple[Array | None, list[str]]:
-    assert bound.time is not None
-    time, name = bound.time[rows], " and ".join(bound.time_source)
-    there = np.isfinite(time)
-    try:
-        stamps.refuse_unordered(table.file, name, time[there], rows[there])
-    except DataError as error:
-        if needed:
-            raise
-        found = stamps.within_stamps(time[there])
-        if found is None:
-            return None, [f"{timing.UNUSED}{error}"]
-        spread, why = found
-        time = time.copy()
-        time[there] = spread
-        return time, [f"{name}: {why}"]
-    return time, timing.interruptions(name, time[there], rows[there])
-
-
-def _start_said(time: Array, options: Options) -> list[str]:
-    if options.time_zero == "column" or time[0] == 0.0:
-        return []
-    return [f"time starts at {time[0]:.9g} s; that sample is t = 0"]
-
-
-def _from_zero(time: Array, bound: _Bound, options: Options) -> Array:
-    """The first sample of a run is t = 0, unless the column's own zero is wanted."""
-    if bound.time is not None and options.time_zero == "column":
-        return time
-    return time if time[0] == 0.0 else time - time[0]
-
-
-def _with_time(
-    signals: dict[str, Array], time: Array | None, wanted: Sequence[Signal]
-) -> dict[str, Array]:
-    """Put the time signal in, in the order in which the model declares its signals."""
-    ordered: dict[str, Array] = {}
-    for signal in wanted:
-        if not is_time(signal):
-            ordered[signal.name] = signals[signal.name]
-        elif time is not None:
-            factor, _ = unit_names.conversion("s", signal.unit or "s")
-            ordered[signal.name] = (time * factor)[:, None]
-    return ordered
-
-
-def _time_unit(signals: Sequence[Signal]) -> dict[str, str | None]:
-    return {s.name: unit_names.canonical(s.unit or "s") for s in signals if is_time(s)}
 
 
 def _group(table: Table, kind: str, options: Options) -> str | None:

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from casest.data import checks, stamps, timing
-from casest.data.bind import is_time, load_runs
+from casest.data.bind import load_runs
+from casest.data.clock import is_time
 from casest.data.run import Run
 from casest.data.table import Table, table_of
 from casest.dataset.files import File, files_of, opened, unreadable

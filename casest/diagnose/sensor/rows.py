@@ -54,7 +54,7 @@ class Rows:
         found = averages(*problem_of(fit, self.runs))
         if found is None:
             return None
-        told = linear.residual.any(axis=1) | linear.slopes.any(axis=(1, 2))
+        told = np.any(linear.residual, axis=1) | np.any(linear.slopes, axis=(1, 2))
         columns = self.of(found) * linear.root[:, :, None] * told[:, None, None]
         return best_mean(linear.residual, replace(linear, feigned=None).basis, columns)
 
