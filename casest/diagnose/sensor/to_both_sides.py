@@ -34,7 +34,7 @@ def to_both_sides(before: Fit, after: Fit, added: Sequence[Candidate], rows: Row
     left = r - Q @ (Q.T @ r)
     if float(np.sum(left**2)) > float(np.sum(other.residual**2)):
         return ""
-    return f"a mean of rows before and after, as noise of the input asks, does as well: {ANOTHER}"
+    return f"noise of the inputs, averaged over rows before and after, does as well: {ANOTHER}"
 
 
 def of_inputs(fit: Fit, rows: Rows) -> float:
