@@ -13,6 +13,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from functools import cache
 from typing import Any
 
 import casadi as ca
@@ -44,7 +45,10 @@ class Size:
             one = self.factor in (None, 1.0)
             return "a pure number" if one else f"a pure number of unit {self.factor:.4g}"
         factor = "" if self.factor in (None, 1.0) else f"{self.factor:.4g} "
-        return factor + "·".join(b if p == 1 else f"{b}^{p}" for b, p in self.powers.items())
+        known = {b: p for b, p in self.powers.items() if not b.startswith("[")}
+        name = _derived().get(frozenset(known.items()))
+        powers = self.powers if name is None else {name: _ONE} | _open_units(self.powers)
+        return factor + "·".join(b if p == 1 else f"{b}^{p}" for b, p in powers.items())
 
 
 PLAIN = Size(None, None, frozenset())
@@ -289,6 +293,18 @@ def refuse_unless_fits(a: Size, b: Size, where: str) -> None:
     raise UnitError(said)
 
 
+@cache
+def _derived() -> dict[frozenset[tuple[str, Fraction]], str]:
+    """Names of units that are products of others, by their powers."""
+    names = ("N", "Pa", "J", "W", "V", "ohm", "T", "C", "F", "H", "Wb")
+    return {frozenset((b, Fraction(p)) for b, p in units.size(n)[1]): n for n in names}
+
+
+def _open_units(powers: Mapping[str, Fraction]) -> dict[str, Fraction]:
+    """Those of signals that have none, as `[pwm]`."""
+    return {b: p for b, p in powers.items() if b.startswith("[")}
+
+
 def _way_out(a: Size, b: Size) -> str:
     """What to mend: a factor between two units of one kind, or the formula."""
     if a.powers == b.powers and a.factor and b.factor:
@@ -296,6 +312,13 @@ def _way_out(a: Size, b: Size) -> str:
         said = f"one kind in two units, {high / low:.4g} to 1: declare both in one of them"
         degrees = abs(high / low * math.pi / 180 - 1) < 1e-9
         return said + (", or multiply degrees by pi / 180" if degrees else "")
-    open_ = next((u for s in (a, b) for u in s.powers or {} if u.startswith("[")), "")
-    own = f', like param("{open_}") in the unit of a signal that has none' if open_ else ""
-    return f"declare another unit{own}, or mend the formula"
+    one, other = (_open_units(s.powers or {}) for s in (a, b))
+    more = [u for u in one | other if one.get(u, 0) != other.get(u, 0)]
+    if not more:
+        return "declare another unit, or mend the formula"
+    alone = next((s for s in (a, b) if s.powers == {more[0]: _ONE}), None)
+    base = a if more[0] not in one else b
+    size = f"{base}" if base.powers else "1"
+    unit = more[0] if alone is not None else f"{size}/{more[0]}"
+    why = f"{more[0]} is the unit of a signal that has none" + ("" if alone else ", and multiplied")
+    return f'declare another unit, like param("{unit}") ({why}), or mend the formula'
