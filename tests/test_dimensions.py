@@ -159,5 +159,18 @@ def test_of_a_signal_without_a_unit_it_is_said_which_unit_an_unknown_has():
     def focus(distance=signal("mm"), position=signal(), *, base=param(), k=param("mm")):
         return Residual(measured=position, predicted=base + k / distance)
 
-    with pytest.raises(UnitError, match=r'like param\("\[position\]"\) in the unit of a signal'):
+    with pytest.raises(UnitError, match=r'like param\("\[position\]"\) \(\[position\] is the unit'):
         check_units(focus)
+
+
+def test_what_multiplies_a_signal_without_a_unit_is_told_its_own():
+    def battery(unit):
+        @model
+        def sagging(pwm=signal(), v=signal("V"), *, emf=param("V"), drop=param(unit)):
+            return Residual(measured=v, predicted=quantity("p", emf - drop * pwm, "V"))
+
+        return sagging
+
+    with pytest.raises(UnitError, match=r'V \(from emf.*against V·\[pwm\].*param\("V/\[pwm\]"\)'):
+        check_units(battery("V"))
+    check_units(battery("V/[pwm]"))

@@ -78,7 +78,7 @@ def test_gains_of_axes_are_no_noise_of_the_reference(tmp_path):
     model.write_text(
         "from casest import Residual, model, param, quantity, signal\n\n\n"
         "@model\n"
-        "def three(u=signal(3, \"uT\"), v=signal(3, \"uT\"), *, gain=param(start=1.0)):\n"
+        'def three(u=signal(3, "uT"), v=signal(3, "uT"), *, gain=param(start=1.0)):\n'
         '    true = quantity("true", u)\n'
         "    return Residual(measured=v, predicted=gain * true, corrected=true)\n",
         encoding="utf-8",
