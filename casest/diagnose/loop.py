@@ -189,10 +189,10 @@ def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str],
         state, outliers = without_outliers(sensor, state, folds)
     if state is not first:
         state = search(sensor, state.fit, say, state)
-    state = with_rivals(sensor, _without_events_of_a_course(sensor, state))
-    after = before
+    state, after = _proved(sensor, state, declared, before)
+    if state.gone and not state.kept:
+        state, after = _proved(sensor, search(sensor, state.fit, say, state), declared, before)
     if state.fit is not declared:
-        state, after = certified(sensor, state, before)
         # What was missing is no noise: parts that are held out are as long as what is left asks.
         if folds.count == LEVELS.refits:
             folds = folded(sensor.runs, after.correlated_over, sensor.seed)
@@ -214,6 +214,14 @@ def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str],
         courses(sensor, state.fit, state.last) if state.last else (),
         of_inputs(state.fit, sensor.rows),
     )
+
+
+def _proved(
+    sensor: Sensor, state: State[Fit], declared: Fit, before: Estimate
+) -> tuple[State[Fit], Estimate]:
+    """The end of a search: rivals of what was added, and the estimate with it."""
+    state = with_rivals(sensor, _without_events_of_a_course(sensor, state))
+    return (state, before) if state.fit is declared else certified(sensor, state, before)
 
 
 def _without_events_of_a_course(sensor: Sensor, state: State[Fit]) -> State[Fit]:

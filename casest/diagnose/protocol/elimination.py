@@ -73,8 +73,7 @@ def eliminated(subject: Subject[F], state: State[F]) -> State[F]:
             return state
         _, why, gone, fit = min(weak, key=lambda w: w[0])
         assert fit is not None
-        state = replace(state, fit=fit, kept=tuple(k for k in state.kept if k is not gone))
-        state = state.refusing(gone.what, why)
+        state = replace(state.dropping(gone, why), fit=fit)
         if why == TOGETHER:
             state = replace(state, open=(gone.evidence, *state.open))
     return state

@@ -338,13 +338,13 @@ def _by_squares(
 
 def shown(
     subject: Subject[F], state: State[F], ranking: Ranking, beside: Sequence[Refit[F]]
-) -> tuple[State[F], list[Refit[F]], list[Evidence]]:
+) -> tuple[State[F], list[Refit[F]], list[Refit[F]]]:
     """What the records show by themselves, and what takes most of the squares though it is no
     likelier (a slow residual is likely as it is), refitted: held-out parts by the refit itself.
 
     And what leaves less than half of all that is held out, though what is slow may do so by chance.
     """
-    found, halving = list[Refit[F]](), list[Evidence]()
+    found, halving = list[Refit[F]](), list[Refit[F]]()
     there = {f for r in beside for f in r.evidence.families}
     most = [t for t in ranking.most if t.family not in there][: LEVELS.contenders]
     for trial in (*subject.shown(state.fit), *most):
@@ -375,8 +375,6 @@ def shown(
             continue
         if few := _by_few_rows(subject, ranking, kept, better):
             state = state.failing(evidence, few)
-        elif clear:
-            found.append(Refit(state.fit, better, kept, seen))
         else:
-            halving.append(kept)
+            (found if clear else halving).append(Refit(state.fit, better, kept, seen))
     return state, found, halving

@@ -46,8 +46,10 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
     nothing = fall.left + fall.gained  # squares without any of them
     # What a slope does not reach as far as is asked by its refit, whatever its columns say.
     shown = {t.family for t in subject.shown(base) if t.what.held}
+    # Beside a slow residual a likelihood says little of what takes most of the squares.
+    most = {t.family for t in ranking.most}
     rivals = list[Evidence]()
-    for e in ranking.causes:
+    for e in sorted(ranking.causes, key=lambda e: e.trials[0].family not in most):
         if e is mine or len(rivals) == 2 * LEVELS.contenders:
             continue
         if e.trials[0].secant and e.gain > LEVELS.nested * mine.gain:
@@ -58,11 +60,12 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
         # What noise of the inputs may have of it is asked of its refit.
         score, gain = e.score + e.feigned, e.gain + e.feigned
         strong = score >= LEVELS.strong if linear.series else ranking.says(e)
-        if not strong and gain < mine.gain:
+        if not strong and gain < mine.gain and e.trials[0].family not in most:
             continue
         its = foretold(linear, [_in_time(ranking, e)], stretches)
         lost = fall_between_causes(linear, its, best)
-        if e.trials[0].family in shown or _as_well(mine.score - score, lost, nothing):
+        held = e.trials[0].what.held  # its columns are those of a grid: a refit goes further
+        if e.trials[0].family in shown or _as_well(mine.score - score, lost, nothing, held=held):
             rivals.append(e)
     after = subject.linear(state.fit)
     found = list[Rival]()
@@ -134,13 +137,18 @@ def _in_time(ranking: Ranking, evidence: Evidence) -> Array:
     return ranking.likelihood.in_time(evidence.basis)
 
 
-def _as_well(behind: float, lost: Fall | None, nothing: float) -> bool:
+def _as_well(behind: float, lost: Fall | None, nothing: float, *, held: object = ()) -> bool:
     """Not clearly less evidence, or what was held out is foretold as well.
 
     lost: of held-out squares, from the other's to its own; `nothing`: those without either. A cause
-    may gain so much that a tenth of it is many times what it leaves: that is not as well.
+    may gain so much that a tenth of it is many times what it leaves: that is not as well. Nor is
+    what leaves more than twice as much, however likely: beside a slow residual that says little.
     """
-    if behind < LEVELS.clear or lost is None:
+    if lost is None:
         return behind < LEVELS.clear
+    if not held and LEVELS.most * (lost.left + lost.gained) > lost.left:
+        return False
+    if behind < LEVELS.clear:
+        return True
     little = lost.gained < min(LEVELS.alike * (nothing - lost.left), lost.left)
     return lost.t < LEVELS.apart and little

@@ -20,13 +20,19 @@ def search(
     say: Callable[[str], None] = lambda _: None,
     begun: State[F] | None = None,
 ) -> State[F]:
-    """Add what is missing, one cause or a pair at a time, until nothing is confirmed any more."""
+    """Add what is missing, one cause or a pair at a time, until nothing is confirmed any more.
+
+    From a state without a cause, none of those that it had and that went again: what came with
+    another may have kept out what does both.
+    """
     state = State(fit) if begun is None else replace(begun, fit=fit, rounds=())
+    barred = frozenset[str]() if state.kept else state.gone
     before: State[F] | None = None
     for _ in range(LEVELS.rounds):
         # Else what lies on an axis that was nothing before would look like another cause.
         state = on_all_axes(subject, state, needed=True)
-        plain = ranked_of(subject.linear(state.fit), subject.trials(state.fit))
+        trials = [t for t in subject.trials(state.fit) if t.family not in barred]
+        plain = ranked_of(subject.linear(state.fit), trials)
         seen = Round(state.fit, tuple(k.what for k in state.kept), plain)
         state = replace(state, rounds=(*state.rounds, seen))
         ranking = refined(subject, state.fit, plain)

@@ -134,7 +134,8 @@ class State(Generic[F]):
     """A search as it stands: the fit, what it has been given, what was refused.
 
     `open`: causes of which one is there, but not one to add; `torn`: their refits, where each would
-    do more harm than none if it is the wrong one; `rounds`: what this search has looked at.
+    do more harm than none if it is the wrong one; `rounds`: what this search has looked at; `gone`:
+    what was added and went again, by label.
     """
 
     fit: F
@@ -145,12 +146,19 @@ class State(Generic[F]):
     first: Ranking | None = None
     last: Ranking | None = None
     rounds: tuple[Round[F], ...] = field(default=(), repr=False)
+    gone: frozenset[str] = frozenset()
 
     def refusing(self, what: Any, why: str) -> State[F]:
         """The state with a refusal, which is said once."""
         if any(r.what == what and r.why == why for r in self.refused):
             return self
         return replace(self, refused=(*self.refused, Refused(what, why)))
+
+    def dropping(self, kept: Kept, why: str) -> State[F]:
+        """The state without a cause that was added, whose fit is another's to say."""
+        others = tuple(k for k in self.kept if k is not kept)
+        gone = self.gone | {kept.what.label}
+        return replace(self, kept=others, gone=gone).refusing(kept.what, why)
 
     def unlike(self, evidence: Evidence) -> bool:
         """Is it a cause that is not what its name says? It explains nothing under that name."""

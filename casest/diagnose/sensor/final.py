@@ -44,7 +44,7 @@ def certified(sensor: Sensor, state: State[Fit], before: Estimate) -> tuple[Stat
             return state, after
         if last is None:
             return state, before
-        state = state.refusing(last.what, why)
+        state = replace(state.refusing(last.what, why), gone=state.gone | {last.what.label})
         instead = None if why == NO_SIZE else _replaced(sensor, state, last)
         if instead is not None:
             state = instead
