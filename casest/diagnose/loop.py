@@ -272,7 +272,8 @@ def _fall(fit: Fit, kept: Kept) -> float:
 
 def _refused(sensor: Sensor, state: State[Fit], declared: Fit) -> tuple[Skipped, ...]:
     added = {k.what.label for k in state.kept}
-    said = {r.what.label: r.why for r in reversed(state.refused) if r.what.label not in added}
+    several = sorted(reversed(state.refused), key=lambda r: not sensor.asked(r.what))
+    said = {r.what.label: r.why for r in several if r.what.label not in added}
     ranked = state.first.found if state.first else ()
     shown = {e.trials[0].family for e in ranked}
     asked, skipped = sensor.tried.unseen(declared, shown)

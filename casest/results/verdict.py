@@ -6,6 +6,8 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Protocol, TypeVar
 
+from msgspec import UNSET
+
 from casest.data.timing import UNUSED
 from casest.declaration.effect import NOISE
 from casest.diagnose.formula.search import NAME as FORMULA
@@ -26,6 +28,8 @@ TO_AND_FRO = -0.32
 LOW_PASS = "low_pass"
 #: Effects from which on, where a misfit remains, they are a description more than causes.
 MANY = 4
+#: Share by which errors of a record that was given are larger than before where that is said.
+WORSE = 0.01
 #: Measurements that would tell causes apart, of which so many are named.
 NAMED = 4
 
@@ -54,12 +58,23 @@ def sentence(result: Closed) -> str:
         return f"adequate: {said}{noise}{untried}"
     if result.verdict == "extended":
         left = _remaining_noise(result.noise, result.samples)
-        return f"extended: {_missing(result.effects)}; what is left is {left}{untried}"
+        missing = f"{_missing(result.effects)}{_elsewhere(result)}"
+        return f"extended: {missing}; what is left is {left}{untried}"
     found = f"beside {', '.join(map(_with_rivals, result.effects))} " if names else ""
     many = ""
     if len(names) >= MANY:
         many = f"; {len(names)} effects together may stand for one that is not among them"
-    return f"unexplained: {found}a misfit remains{_which(result.unexplained)}{many}"
+    which = _which(result.unexplained)
+    return f"unexplained: {found}a misfit remains{which}{many}{_elsewhere(result)}"
+
+
+def _elsewhere(result: Closed) -> str:
+    """That a record which was given to be foretold is foretold worse with what was added."""
+    before, after = result.before.rmse_holdout, result.after.rmse_holdout
+    if result.holdout is UNSET or not result.effects or before is None or after is None:
+        return ""
+    worse = after > (1 + WORSE) * before
+    return f", but {', '.join(result.holdout)} is foretold worse with it" if worse else ""
 
 
 def _which(left: Unexplained) -> str:

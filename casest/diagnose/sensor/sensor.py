@@ -184,7 +184,7 @@ class Sensor(Subject[Fit]):
         why = (
             too_slow(after.values, added, spans)
             or another(after.model, after.values, self.model)[1]
-            or stands_in(before, after, added, self.rows)
+            or stands_in(before, after, [w for w in added if not self.asked(w)], self.rows)
             or driven(before, after, added, self.rows)
             or to_both_sides(before, after, added, self.rows)
         )
