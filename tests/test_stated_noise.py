@@ -357,7 +357,8 @@ def test_compare_and_observe_know_stated_noise_too(weighed, capsys, tmp_path, ve
         std = np.hypot(0.4, 2 * 0.1) / np.sqrt(np.sum((y - 3) ** 2))
         assert found["std"]["b1"] == pytest.approx(std, rel=0.01)
     else:
-        assert found["noise"]["sigma"] == pytest.approx(0.4)  # of the reading, as it was stated
+        # Of a residual: that of the reading, and what the input's makes of it on a slope of two.
+        assert found["noise"]["sigma"] == pytest.approx(np.hypot(0.4, 2 * 0.1), rel=0.01)
         assert found["solvers"][0]["same_start"]["right"]
 
 

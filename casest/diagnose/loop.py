@@ -161,7 +161,8 @@ def _searched(
         except DataError as error:
             return _as_it_is(before, ready, str(error))
         # True values are pulled towards a model that lacks something: it is looked for as read.
-        model = model.as_read
+        if model.noise is not None:  # in the units that its residuals are told in
+            model = replace(model, noise=before.model.noise).as_read
         sensor = Sensor(model, ready, tuple(catalogue), frozenset(known), seed)
         return _closed(sensor, before, folds, say)
 
@@ -192,10 +193,9 @@ def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str],
     state, after = _proved(sensor, state, declared, before)
     if state.gone and not state.kept:
         state, after = _proved(sensor, search(sensor, state.fit, say, state), declared, before)
-    if state.fit is not declared:
+    if state.fit is not declared and folds.count == LEVELS.refits:
         # What was missing is no noise: parts that are held out are as long as what is left asks.
-        if folds.count == LEVELS.refits:
-            folds = folded(sensor.runs, after.correlated_over, sensor.seed)
+        folds = folded(sensor.runs, after.correlated_over, sensor.seed)
     state, after, hidden = foretelling(sensor, declared, state, before, after, folds)
     effects = [] if outliers is None else [outliers]
     effects += [_found(sensor, state, k, after) for k in state.kept]

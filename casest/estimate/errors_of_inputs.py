@@ -13,7 +13,7 @@ from casest.errors import NotTrusted
 from casest.estimate.evidence import Evidence
 from casest.leastsquares.neighbours import scatter
 from casest.leastsquares.problem import Point, Problem
-from casest.leastsquares.stated import at_true_values, settles
+from casest.leastsquares.stated import at_true_values, in_usual_units, settles
 from casest.leastsquares.weights import has_noise_effects
 from casest.solve.outcome import Outcome
 from casest.solve.strategy import best_of, solve
@@ -57,7 +57,9 @@ def with_errors_of_inputs(
         step = problem.difference(end, point)
         size = float(np.linalg.norm(problem.factor(end)[0] @ step) / noise.scale)
         if size <= STILL:
-            return solve(problem, end, solver=solver, seed=seed)
+            problem = in_usual_units(problem)
+            first = problem.point(problem.values(end))
+            return solve(problem, first, solver=solver, seed=seed)
         steps, ends = [*steps, step][-MEMORY:], [*ends, end][-MEMORY:]
         point = _ahead(problem, steps, ends)
     raise NotTrusted(

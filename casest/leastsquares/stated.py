@@ -326,6 +326,23 @@ def at_true_values(problem: Problem, point: Point) -> Problem:
     return replace(problem, runs=tuple(runs))
 
 
+def in_usual_units(problem: Problem) -> Problem:
+    """The problem with the noise of a usual residual as its scale, that of the inputs with it,
+    which hangs on how steep the model is: now it is known."""
+    noise, m = problem.model.noise, len(problem.model.axes)
+    assert noise is not None
+    held = [run.signals[WHITENING].reshape(len(run), m, m) for run in problem.runs]
+    lower = np.concatenate([np.linalg.inv(w) for w in held])
+    usual = noise.scale * float(np.sqrt(np.median(np.sum(lower**2, axis=2))))
+    larger = usual / noise.scale
+    runs = [
+        replace(run, signals={**run.signals, WHITENING: larger * run.signals[WHITENING]})
+        for run in problem.runs
+    ]
+    model = replace(problem.model, noise=replace(noise, scale=usual))
+    return replace(problem, model=model, runs=tuple(runs))
+
+
 def _likeliest(model: Model, parameters: Array, run: Run, noise: Stated) -> Array:
     """ξ (k, N) = s - CGᵀV⁻¹w, with G and w where it is itself.
 
