@@ -41,18 +41,24 @@ def rises(
 
 
 def rise_of_squares(less: Linear, more: Linear, cut: Array | None = None) -> float:
-    """2 log of the likelihood ratio of squares, of as many samples as are independent.
+    """2 log of the likelihood ratio of squares, of as many samples as are independent."""
+    count, rise = of_squares(less, more, cut)
+    return count * rise
+
+
+def of_squares(less: Linear, more: Linear, cut: Array | None = None) -> tuple[float, float]:
+    """How many samples are independent, and 2 log of the likelihood ratio of squares of each.
 
     As many as noise of the spectrum of all that there was would leave of what is taken away
     (Bartlett 1935): what is missing counts as noise, so they are too few. Nothing where less than
     most of the squares are taken. `cut`: as of a likelihood.
     """
     if not less.coloured or less.residual.shape != more.residual.shape:
-        return -np.inf
+        return 1.0, -np.inf
     without, beside = Likelihood(less, cut), Likelihood(more, cut)
     before, after = without.residual, beside.residual
     taken, b, a = before - after, float(before @ before), float(after @ after)
     if a > LEVELS.most * b:
-        return -np.inf
+        return 1.0, -np.inf
     noise = float(without.beside().powers @ without.sums.summed(taken**2))
-    return b * float(taken @ taken) / max(noise, 1e-300) * float(np.log(b / max(a, 1e-300)))
+    return b * float(taken @ taken) / max(noise, 1e-300), float(np.log(b / max(a, 1e-300)))

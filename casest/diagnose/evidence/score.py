@@ -186,6 +186,14 @@ def with_chance(evidence: Evidence, likelihood: Likelihood, families: int) -> Ev
     return replace(evidence, p_value=chance)
 
 
+def priced(evidence: Evidence, gain: float, count: float, families: int) -> Evidence:
+    """With a gain of so many independent samples, and their price of an unknown."""
+    gain -= evidence.feigned
+    price = evidence.freedom * float(np.log(max(count, 2.0)))
+    return replace(evidence, gain=gain,
+                   score=gain - price - 2 * _searched(evidence.trials, families))  # fmt: skip
+
+
 def _searched(trials: Sequence[Trial], families: int) -> float:
     """Log of how much was looked through to find these."""
     several = len({t.family for t in trials}) * float(np.log(families))

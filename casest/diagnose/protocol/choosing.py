@@ -49,7 +49,7 @@ def with_the_best(
         if not asked and not tried:
             state, more, halving = shown(subject, state, ranking, refits)
             refits = best_refits(refits, more, ranking.order)
-            refits = _best_foretold_first(subject, state, ranking, refits, halving)
+            refits = _best_foretold_first(subject, state, ranking, refits)
         torn = [] if asked else torn_between(refits, ranking)
         if torn:
             return replace(state, open=tuple(r.evidence for r in torn), torn=tuple(torn))
@@ -76,24 +76,18 @@ def with_the_best(
 
 
 def _best_foretold_first(
-    subject: Subject[F],
-    state: State[F],
-    ranking: Ranking,
-    refits: list[Refit[F]],
-    halving: Sequence[Refit[F]],
+    subject: Subject[F], state: State[F], ranking: Ranking, refits: list[Refit[F]]
 ) -> list[Refit[F]]:
     """None comes before one that leaves less than half of what it leaves, wherever it is held out:
-    what a steady motion leaves is lines, and to a likelihood these are noise however large. Also
-    before one of those `halving` what is held out, which alone a slow course might do by chance."""
-    every = [*refits, *halving]
-    if not ranking.linear.series or not refits or len(every) < 2:
+    what a steady motion leaves is lines, and to a likelihood these are noise however large."""
+    if not ranking.linear.series or len(refits) < 2:
         return refits
     seen = [
         {k: f.ratio for k, f in (r.falls or _falls(subject, state, ranking, r)).items()}
-        for r in every
+        for r in refits
     ]
     most = {k: LEVELS.most * ratio for k, ratio in seen[0].items()}
-    better = [r for r, own in zip(every, seen, strict=True) if all(own[k] < most[k] for k in most)]
+    better = [r for r, own in zip(refits, seen, strict=True) if all(own[k] < most[k] for k in most)]
     best = max(better, key=lambda r: r.evidence.score, default=refits[0])
     return [best, *[r for r in refits if r is not best]]
 

@@ -11,12 +11,13 @@ from casest.declaration.shapes import Array
 from casest.diagnose.evidence.by_row import carried_by_few, chance_by_row, chance_together
 from casest.diagnose.evidence.input_noise import at_most, feigned_by_refit
 from casest.diagnose.evidence.linear import Linear, alike
-from casest.diagnose.evidence.rises import rise_of_squares, rises
+from casest.diagnose.evidence.rises import of_squares, rises
 from casest.diagnose.evidence.score import (
     Evidence,
     Trial,
     expected_loss,
     judged,
+    priced,
     shared_chance,
     with_chance,
 )
@@ -328,12 +329,16 @@ def _by_squares(
     subject: Subject[F], state: State[F], ranking: Ranking, evidence: Evidence, fit: F
 ) -> Evidence:
     """By what its refit takes of the squares, less what noise of the inputs may feign of these: a
-    likelihood beside smooth noise weighs what is quick, and that may be all noise."""
+    likelihood beside smooth noise weighs what is quick, and that may be all noise. Of as many
+    samples as are independent, which set the price of an unknown as well."""
     plain = ranking.likelihood.plainly(evidence.beyond)
     seen = replace(evidence, explained=plain, score=np.inf)
     (seen,) = without_feigned(subject, state.fit, ranking.likelihood, [seen], ranking.families)
     before, after = alike([ranking.linear, subject.linear(fit)])
-    return _gaining(replace(evidence, trials=seen.trials), rise_of_squares(before, after))
+    count, rise = of_squares(before, after)
+    share = min(1.0, count / ranking.likelihood.residual.size)
+    trials = tuple(replace(t, feigned=share * t.feigned) for t in seen.trials)
+    return priced(replace(evidence, trials=trials), count * rise, count, ranking.families)
 
 
 def shown(

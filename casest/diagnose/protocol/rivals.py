@@ -46,8 +46,9 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
     nothing = fall.left + fall.gained  # squares without any of them
     # What a slope does not reach as far as is asked by its refit, whatever its columns say.
     shown = {t.family for t in subject.shown(base) if t.what.held}
-    # Beside a slow residual a likelihood says little of what takes most of the squares.
+    # Of causes that take most of the squares of a slow residual a likelihood says little.
     most = {t.family for t in ranking.most}
+    most = most if own.family in most else set()
     rivals = list[Evidence]()
     for e in sorted(ranking.causes, key=lambda e: e.trials[0].family not in most):
         if e is mine or len(rivals) == 2 * LEVELS.contenders:
