@@ -41,10 +41,8 @@ class Levels:
     passing: share of a record's rows up to which inputs that are held else go from level to level.
     fades: time constants that a record must span for a memory to be seen to fade.
     most: share of the squares below which what is left says more than how likely a slow course is;
-    survives: share of a cause's length that the declared unknowns must leave; exact: where a reading
-        is predicted, whose slopes have no noise (a ruler may begin anywhere: of inputs from 12.5 to
-        12.7 a square is a line but for 2e-5); over_noise: an implicit residual's slopes contain its
-        noise, of which so many must survive.
+    survives: share of a cause's length that the declared unknowns must leave; over_noise: an
+        implicit residual's slopes contain its noise, of which so many must survive.
     seen, unseen: noncentrality of the score from which on an effect is found nearly always, and
         below which (three standard deviations) nobody could.
     told_share: of the variance, below which what causes explain alike is printed as 0 %.
@@ -101,7 +99,6 @@ class Levels:
     passing: float = 0.25
     fades: float = 2.0
     survives: float = 1e-3
-    exact: float = 1e-6
     most: float = 0.5
     over_noise: float = 5.0
     seen: float = 45.0

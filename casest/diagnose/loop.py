@@ -205,7 +205,7 @@ def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str],
         after,
         *on_the_same_samples(*hidden),
         tuple(effects),
-        tuple(sensor.tried.found(declared)[1]),
+        (*sensor.tried.found(declared)[1], *sensor.tried.straight(declared, _shown(state))),
         _refused(sensor, state, declared),
         folds,
         seen,
@@ -274,14 +274,18 @@ def _refused(sensor: Sensor, state: State[Fit], declared: Fit) -> tuple[Skipped,
     added = {k.what.label for k in state.kept}
     several = sorted(reversed(state.refused), key=lambda r: not sensor.asked(r.what))
     said = {r.what.label: r.why for r in several if r.what.label not in added}
-    ranked = state.first.found if state.first else ()
-    shown = {e.trials[0].family for e in ranked}
-    asked, skipped = sensor.tried.unseen(declared, shown)
+    asked, skipped = sensor.tried.unseen(declared, _shown(state))
+    hidden = {s.name for s in asked}
     return (
-        *(Skipped(name, why) for name, why in said.items()),
         *asked,
+        *(Skipped(name, why) for name, why in said.items() if name not in hidden),
         *(s for s in skipped if s.name not in said),
     )
+
+
+def _shown(state: State[Fit]) -> set[str]:
+    """What has something to show beside the declared unknowns."""
+    return {e.trials[0].family for e in state.first.found} if state.first else set()
 
 
 def _visible(sensor: Sensor, declared: Fit) -> tuple[Visible, ...]:

@@ -26,6 +26,11 @@ MISSING = {
     "output": "names no prediction: predicted=quantity(…) gives it a name",
 }
 
+#: Why a bend is not looked at, and the way out.
+STRAIGHT = (
+    "what the sensor met lies far from zero for its range, where it is a straight line: count it "
+    "from its middle"
+)
 #: The same of an effect that remembers.
 UNTIMED = (
     "rows without a time are in no order: --rate 1 says that each was read after the one before"

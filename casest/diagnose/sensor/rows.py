@@ -114,7 +114,7 @@ class Rows:
     def _least(self, fit: Fit) -> float:
         """Slopes of an implicit residual contain the residual: what survives must be more."""
         if not fit.model.implicit or noises(fit.model):  # or is counted in deviations
-            return LEVELS.exact
+            return LEVELS.survives
         names = [
             s.name
             for s in fit.model.signals
