@@ -203,7 +203,9 @@ def _unhelpful(record: Record, row: Row) -> Iterator[str]:
     if row["verdict"] not in right.verdicts:
         yield f"verdict {row['verdict']}"
     after = row["stretches"][1] if row["stretches"][1] is not None else row["folds"][1]
-    if right.within is not None and (after is None or after > right.within):
+    # Of causes that explain a record alike none need be claimed, and then nothing is taken away.
+    torn = {_bare(name) for name in row["one_of"]} & right.rivals
+    if right.within is not None and not torn and (after is None or after > right.within):
         yield f"{_number(after)} is left on stretches held out, {right.within:g} would be possible"
 
 
