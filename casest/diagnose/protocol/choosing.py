@@ -88,7 +88,11 @@ def _best_foretold_first(
     ]
     most = {k: LEVELS.most * ratio for k, ratio in seen[0].items()}
     better = [r for r, own in zip(refits, seen, strict=True) if all(own[k] < most[k] for k in most)]
-    best = max(better, key=lambda r: r.evidence.score, default=refits[0])
+    most_likely = max((r.evidence.score for r in better), default=0.0)
+    near = [r for r in better if r.evidence.score > most_likely - LEVELS.strong]
+    # Of equal ones the first of the catalogue: what is met more often.
+    usual = {id(r): min(ranking.order.get(f, 0) for f in r.evidence.families) for r in near}
+    best = min(near, key=lambda r: usual[id(r)], default=refits[0])
     return [best, *[r for r in refits if r is not best]]
 
 

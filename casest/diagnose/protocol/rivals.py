@@ -31,7 +31,7 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
     if apart is None or there is None:
         return state, []
     base, ranking = there
-    linear, own = ranking.linear, apart[1]
+    linear, own, slow = ranking.linear, apart[1], ranking.linear.coloured
     others = [e for e in ranking.found if e.trials[0].family != own.family]
     if own.columns.shape[:2] == linear.residual.shape:
         mine = judged([own], ranking.likelihood, ranking.none, families=ranking.families)
@@ -65,8 +65,9 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
             continue
         its = foretold(linear, [_in_time(ranking, e)], stretches)
         lost = fall_between_causes(linear, its, best)
-        held = e.trials[0].what.held  # its columns are those of a grid: a refit goes further
-        if e.trials[0].family in shown or _as_well(mine.score - score, lost, nothing, held=held):
+        # The columns of a grid's value promise little: a refit goes further.
+        told = slow and not e.trials[0].what.held
+        if e.trials[0].family in shown or _as_well(mine.score - score, lost, nothing, told):
             rivals.append(e)
     after = subject.linear(state.fit)
     found = list[Rival]()
@@ -82,7 +83,7 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
         if {x.residual.shape for x in (linear, after, other)} == {linear.residual.shape}:
             own_errors, its_errors = (foretold(x, [], stretches) for x in alike([after, other]))
             again = fall_between_causes(after, its_errors, own_errors)
-        if _as_well(behind, again, nothing):
+        if _as_well(behind, again, nothing, slow):
             found.append(Rival(e.trials[0].what, fit))
     return state, found
 
@@ -138,16 +139,16 @@ def _in_time(ranking: Ranking, evidence: Evidence) -> Array:
     return ranking.likelihood.in_time(evidence.basis)
 
 
-def _as_well(behind: float, lost: Fall | None, nothing: float, *, held: object = ()) -> bool:
+def _as_well(behind: float, lost: Fall | None, nothing: float, slow: bool) -> bool:
     """Not clearly less evidence, or what was held out is foretold as well.
 
     lost: of held-out squares, from the other's to its own; `nothing`: those without either. A cause
     may gain so much that a tenth of it is many times what it leaves: that is not as well. Nor is
-    what leaves more than twice as much, however likely: beside a slow residual that says little.
+    what leaves more than twice as much, where noise may be `slow`: then a likelihood says little.
     """
     if lost is None:
         return behind < LEVELS.clear
-    if not held and LEVELS.most * (lost.left + lost.gained) > lost.left:
+    if slow and LEVELS.most * (lost.left + lost.gained) > lost.left:
         return False
     if behind < LEVELS.clear:
         return True

@@ -14,6 +14,7 @@ from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol import Kept, State
 from casest.diagnose.protocol.elimination import on_its_own
 from casest.diagnose.protocol.ranking import ranked
+from casest.diagnose.protocol.state import ANOTHER
 from casest.diagnose.sensor.fits import Fit
 from casest.diagnose.sensor.sensor import Sensor
 from casest.diagnose.sensor.unlike import another
@@ -44,7 +45,9 @@ def certified(sensor: Sensor, state: State[Fit], before: Estimate) -> tuple[Stat
             return state, after
         if last is None:
             return state, before
-        state = replace(state.refusing(last.what, why), gone=state.gone | {last.what.label})
+        state = state.refusing(last.what, why)
+        if ANOTHER in why:
+            state = replace(state, gone=state.gone | {last.what.label})
         instead = None if why == NO_SIZE else _replaced(sensor, state, last)
         if instead is not None:
             state = instead
