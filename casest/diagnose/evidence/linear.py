@@ -49,8 +49,8 @@ class Linear:
     are poses, or of a table, and their noise is white. `least`: share of a cause's length that must
     survive beside the unknowns. `plateaus`: the number of each row's (N,), where inputs are held.
     `roots` (N, m): what rows are multiplied by, the root of their weights; None: by one. `feigned`
-    (N, m, k): what noise of the inputs makes of the residuals, which a cause must explain more
-    than; None: nothing.
+    (N, m, k): what noise of the inputs makes of the residuals; None: nothing. Where it `counts`, a
+    cause must explain something beside it.
     """
 
     residual: Array
@@ -61,11 +61,12 @@ class Linear:
     plateaus: Index | None = None
     roots: Array | None = None
     feigned: Array | None = None
+    counts: bool = False
 
     @property
     def beside(self) -> Array:
-        """Slopes (N, m, p + k), and what noise of the inputs makes."""
-        if self.feigned is None:
+        """Slopes (N, m, p + k), and what noise of the inputs makes where it counts."""
+        if self.feigned is None or not self.counts:
             return self.slopes
         return np.concatenate([self.slopes, self.feigned], axis=2)
 
@@ -119,8 +120,11 @@ class Linear:
 
 
 def alike(fits: Sequence[Linear]) -> list[Linear]:
-    """Fits to the same rows, without those that one of them has nothing to say of: a lag leaves
-    some whose cause nobody recorded. Fits to other rows are returned as they are."""
+    """Fits to be compared: where noise of the inputs counts in one it counts in all, and to the same
+    rows, without those that one of them has nothing to say of: a lag leaves some whose cause nobody
+    recorded."""
+    counts = any(fit.counts for fit in fits)
+    fits = [fit if fit.counts == counts else replace(fit, counts=counts) for fit in fits]
     if len({fit.residual.shape for fit in fits}) > 1:
         return list(fits)
     silent = [~(fit.residual.any(axis=1) | fit.slopes.any(axis=(1, 2))) for fit in fits]

@@ -25,12 +25,11 @@ STARTS, STEPS = 50, 20
 
 @dataclass(frozen=True)
 class FewRows:
-    """The rows, their share of the squares, the chance, and the others' standard deviation."""
+    """The rows, their share of the squares, and the chance."""
 
     rows: Index
     share: float
     p_value: float
-    sigma: float
 
 
 def few_rows(residual: Array, slopes: Array, rounding: float = 0.0) -> FewRows | None:
@@ -64,8 +63,7 @@ def few_rows(residual: Array, slopes: Array, rounding: float = 0.0) -> FewRows |
         chance = min(1.0, float(fdtrc(axes * k, rest, F)) * comb(rows, k) * most)
         share = 1 - least / max(whole, 1e-300)
         if share > LEVELS.most and chance < LEVELS.chance:
-            gone = np.setdiff1d(np.arange(rows), kept)
-            best = FewRows(gone, share, chance, float(np.sqrt(least / rest)))
+            best = FewRows(np.setdiff1d(np.arange(rows), kept), share, chance)
     return best
 
 

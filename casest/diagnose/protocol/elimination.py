@@ -10,6 +10,7 @@ import numpy as np
 from casest.diagnose.evidence.by_row import chance_by_row
 from casest.diagnose.evidence.input_noise import at_most
 from casest.diagnose.evidence.likelihood import Likelihood
+from casest.diagnose.evidence.linear import alike
 from casest.diagnose.evidence.score import p_value, worth
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol.confirming import falls_of_refit
@@ -34,12 +35,12 @@ def on_all_axes(subject: Subject[F], state: State[F], *, needed: bool) -> State[
         if found is None:
             continue
         what, fit = found
-        none, all_ = Likelihood(subject.linear(state.fit)), subject.linear(fit)
-        more = all_.basis.shape[1] - none.declared.shape[1]
+        less, all_ = alike([subject.linear(state.fit), subject.linear(fit)])
+        more = all_.basis.shape[1] - less.basis.shape[1]
         if more < 1:
             continue
-        rise = worth(subject.rises(state.fit, [fit])[0], more, 0.0, none) if needed else np.inf
-        if rise > LEVELS.strong:
+        gain = subject.rises(state.fit, [fit])[0]
+        if not needed or worth(gain, more, 0.0, Likelihood(less)) > LEVELS.strong:
             trials = tuple(replace(t, what=what) if t.what == kept.what else t
                            for t in kept.evidence.trials)  # fmt: skip
             evidence = replace(kept.evidence, trials=trials)
@@ -103,7 +104,7 @@ def _alone(
 ) -> tuple[float, float, float]:
     """Score and p of a cause beside the others, `base` being the fit without it, and the log of
     what was looked through for it."""
-    linear, whole = subject.linear(base), subject.linear(state.fit)
+    linear, whole = alike([subject.linear(base), subject.linear(state.fit)])
     none, gain = Likelihood(linear), subject.rises(base, [state.fit])[0] - feigned
     freedom = max(whole.basis.shape[1] - linear.basis.shape[1], 1)
     families = _looked_through(subject, state, kept)

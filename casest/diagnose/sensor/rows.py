@@ -43,9 +43,10 @@ class Rows:
         parts, held = parts_of(*self._numbers, met), plateaus_of(met, self._spans)
         found = Linear(residual, J, self._spans, parts, self._least(fit), held, roots)
         mean = self.best_mean(fit, found)
-        if mean is None or share_taken(found, mean) <= LEVELS.most:
+        if mean is None:
             return found
-        return replace(found, feigned=mean[:, :, None])
+        most = share_taken(found, mean) > LEVELS.most
+        return replace(found, feigned=mean[:, :, None], counts=most)
 
     def best_mean(self, fit: Fit, linear: Linear) -> Array | None:
         """What the best mean of inputs over rows before and after takes away (N, m)."""
@@ -56,7 +57,7 @@ class Rows:
             return None
         told = np.any(linear.residual, axis=1) | np.any(linear.slopes, axis=(1, 2))
         columns = self.of(found) * linear.root[:, :, None] * told[:, None, None]
-        return best_mean(linear.residual, replace(linear, feigned=None).basis, columns)
+        return best_mean(linear.residual, replace(linear, counts=False).basis, columns)
 
     def of(self, values: Sequence[Array]) -> Array:
         """Values of each run (N, …) in the rows that are looked at, one run after the other."""

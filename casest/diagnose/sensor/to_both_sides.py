@@ -29,7 +29,7 @@ def to_both_sides(before: Fit, after: Fit, added: Sequence[Candidate], rows: Row
     mean = rows.best_mean(before, one) if one.residual.shape == other.residual.shape else None
     if mean is None:
         return ""
-    Q = replace(one, feigned=mean[:, :, None]).basis
+    Q = replace(one, feigned=mean[:, :, None], counts=True).basis
     r = one.residual.ravel()
     left = r - Q @ (Q.T @ r)
     if float(np.sum(left**2)) > float(np.sum(other.residual**2)):
@@ -40,6 +40,5 @@ def to_both_sides(before: Fit, after: Fit, added: Sequence[Candidate], rows: Row
 def of_inputs(fit: Fit, rows: Rows) -> float:
     """Share of what is left of held-out squares that such a mean takes: noise of what is read
     beside the reading, or readings that were averaged themselves; 0 where there is no saying."""
-    plain = replace(rows.linear(fit), feigned=None)
-    mean = rows.best_mean(fit, plain)
-    return 0.0 if mean is None else share_taken(plain, mean)
+    plain = replace(rows.linear(fit), counts=False)
+    return 0.0 if plain.feigned is None else share_taken(plain, plain.feigned[:, :, 0])
