@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import numpy as np
+import pytest
 from scipy.ndimage import gaussian_filter1d
 
 from casest import close
@@ -56,19 +57,37 @@ def test_what_is_asked_for_takes_the_place_of_an_input():
     assert float(found.before.values["gain"]) > 1
 
 
-def test_a_bend_that_a_ruler_far_from_its_zero_hides_is_said(tmp_path, capsys):
-    """From 12.5 to 12.7 a square is a line but for 2e-5: what is asked for is answered first."""
+@pytest.mark.parametrize("zero", [0.0, 12.6, -293.0])
+def test_a_bend_is_the_same_wherever_the_input_is_counted_from(tmp_path, capsys, zero):
+    """From 12.5 to 12.7 a square about zero is a line but for 2e-5."""
     rng = np.random.default_rng(5)
     x = rng.uniform(-0.1, 0.1, 60)
     y = 30 * x + 400 * x**2 + 0.2 * rng.standard_normal(60)
-    found = close("linear", {"reference": x, "reading": y}, known={"quadratic"})
-    assert [e.candidate.label for e in found.effects] == ["quadratic"]
     path = tmp_path / "ruler.csv"
-    table = np.column_stack([x + 12.6, y])
+    table = np.column_stack([x + zero, y])
     np.savetxt(path, table, delimiter=",", header="reference,reading", comments="")
     assert run(["close", "linear", str(path), "--effects", "quadratic", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert found["refused"][0]["name"] == "quadratic"
-    assert "count it from its middle" in found["refused"][0]["reason"]
-    straight = {s["name"] for s in found["not_tried"] if "count it from" in s["reason"]}
-    assert straight == {"quadratic", "signed_quadratic", "cubic", "signed_cubic"}
+    (effect,) = found["effects"]
+    assert effect["name"] == "quadratic"
+    at = effect["numbers"]["at"]
+    assert at == (pytest.approx(zero + x.mean(), rel=1e-5) if zero else 0)
+    # The slope at the middle is the gain there, and the bend over the gain is what it is.
+    values = {name: p["value"] for name, p in found["after"]["parameters"].items()}
+    middle = values["gain"] * (1 + 2 * values["quadratic.k"] * (zero - at))
+    assert middle == pytest.approx(30, abs=3)
+    assert values["gain"] * values["quadratic.k"] == pytest.approx(400, abs=40)
+    shown = "u + k·(u −" if zero else "u + k·u²"
+    assert effect["formula"].startswith(shown)
+
+
+@pytest.mark.parametrize("bend", [0.003, 0.03, 0.3])
+def test_a_thermometer_in_kelvin_bends(bend):
+    """Of 0.3 to 30 % over 270 to 310 K: about zero kelvin the gain would have to pass zero."""
+    rng, t = np.random.default_rng(7), 0.1 * np.arange(400)
+    x = np.sin(0.7 * t) * np.cos(0.13 * t)
+    y = 1.02 * 20 * x + 20 * bend * x**2 + 0.01 * rng.standard_normal(400)
+    found = close("linear", {"t": t, "reference": 290 + 20 * x, "reading": y})
+    assert [e.candidate.label for e in found.effects] == ["quadratic"]
+    assert found.verdict == "extended"
+    assert found.after.rmse == pytest.approx(0.01, rel=0.1)

@@ -34,7 +34,7 @@ NOISE = "noise"
 #: itself whose rate it is, or another state; of a number that data tell; of what is searched over a
 #: grid; and of where one on the noise shows itself.
 COLUMNS = ("temperature", "other", "any", "angle", "acceleration", "itself", "state")
-NUMBERS = ("mean", "least", "greatest", "duration", "radian")
+NUMBERS = ("mean", "least", "greatest", "duration", "radian", "middle")
 PROFILES = (
     "frequency", "time", "timescale", "memory", "level", "floor", "threshold", "band", "share",
     "lag",
@@ -61,10 +61,11 @@ class Effect:
     or "acceleration", another measured signal of three axes; on a rate "itself", the state whose
     rate it is, or "state", any other); `numbers` those
     that data tell (name -> "mean", "least" or "greatest" of that column, "radian": rad for each of
-    its unit, or "duration" of the record); `seen_in` where an effect on the noise shows itself: the
-    "tails" of the residuals, or a "random walk" in them; `describes`: it says what a course looks
-    like, and names no cause; `memory` what one on the sequence keeps from sample to sample, and
-    what each begins from (the value acted on, or a number); `otherwise` the form that it takes in a
+    its unit, "duration" of the record, or "middle" of a recorded input that is far from zero, else
+    0); `seen_in` where an effect on the noise shows itself: the "tails" of the residuals, or a
+    "random walk" in them; `describes`: it says what a course looks like, and names no cause;
+    `memory` what one on the sequence keeps from sample to sample, and what each begins from (the
+    value acted on, or a number); `otherwise` the form that it takes in a
     model where it is not applicable as it stands; `once`: it happened in the record that it was
     found in, and has "passed" (in another one it is not there) or "stayed" (in another one nobody
     knows how much of it is there); `foreign_to` kinds of reading, by a unit each, of which no

@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 
 from casest.data.run import Run
@@ -26,12 +27,7 @@ MISSING = {
     "output": "names no prediction: predicted=quantity(…) gives it a name",
 }
 
-#: Why a bend is not looked at, and the way out.
-STRAIGHT = (
-    "what the sensor met lies far from zero for its range, where it is a straight line: count it "
-    "from its middle"
-)
-#: The same of an effect that remembers.
+#: Why an effect that remembers is not looked at, and the way out.
 UNTIMED = (
     "rows without a time are in no order: --rate 1 says that each was read after the one before"
 )
@@ -149,10 +145,11 @@ def with_numbers(
     runs: Sequence[Run],
     model: Model | None = None,
 ) -> Effect:
-    """Numbers that come from the data: the channel's mean, range and unit, the record's duration.
+    """Numbers that come from the data: the channel's mean, range and unit, the record's duration,
+    the middle of what it acts on.
 
-    `model` tells the unit of a channel that is one of its quantities. Raises UnitError where a
-    channel should be an angle and is none.
+    `model` tells the unit of a channel that is one of its quantities, and which are recorded.
+    Raises UnitError where a channel should be an angle and is none.
     """
     values: dict[str, float] = {}
     for name, what in effect.numbers:
@@ -161,10 +158,30 @@ def with_numbers(
             values[name] = float(f"{OF_COLUMN[what](x):.6g}")
         if what == "radian" and columns:
             values[name] = _radian(columns[0][1], runs, model)
+        if what == "middle":
+            values[name] = _middle(effect.on, runs, model)
         if what == "duration":
             ends = [float(np.ptp(run.signals["t"])) for run in runs if "t" in run.signals]
             values[name] = float(f"{max(ends, default=1.0) or 1.0:.6g}")
     return effect.holding(**values) if values else effect
+
+
+def _middle(name: str, runs: Sequence[Run], model: Model | None) -> float:
+    """Mean of a scalar quantity that recorded signals alone make, where it is further from zero
+    than it ranges; else zero."""
+    quantity = None if model is None else model.quantities.get(name)
+    if model is None or quantity is None or quantity.dims or model.traced.integrates:
+        return 0.0
+    scalars = [s.name for s in model.signals if s.size == 1 and s.name in runs[0].signals]
+    symbols = [model.traced.symbols[n] for n in scalars]
+    value = ca.Function("quantity", symbols, [quantity.declared], {"allow_free": True})
+    if not scalars or value.has_free():
+        return 0.0
+    read = [[run.signals[n][:, 0] for n in scalars] for run in runs]
+    x = np.concatenate([np.asarray(value(*(v[None] for v in values))).ravel() for values in read])
+    x = x[np.isfinite(x)]
+    mean = float(np.mean(x)) if len(x) else 0.0
+    return float(f"{mean:.6g}") if len(x) and np.ptp(x) < abs(mean) else 0.0
 
 
 def angles(model: Model, runs: Sequence[Run]) -> list[str]:

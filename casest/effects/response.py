@@ -5,7 +5,7 @@ from __future__ import annotations
 from casest.declaration.effect import effect
 from casest.declaration.physics import SX, dot, fabs, fmax, inf, sign, vertcat
 from casest.declaration.shapes import each
-from casest.declaration.symbols import param
+from casest.declaration.symbols import constant, param
 from casest.errors import UsageError
 
 
@@ -118,44 +118,52 @@ def gain_by_sign(u: SX, *, k: SX = param(each)) -> SX:
     on="input",
     typical={"k": 2e-4},
     shown_by="inputs of several sizes and both signs on each axis",
-    formula="u + k·u²",
+    formula="u + k·(u − at)²",
+    numbers={"at": "middle"},
 )
-def quadratic(u: SX, *, k: SX = param(each, "1/[u]")) -> SX:
-    """Second-order response of each axis (Batista, eq. 2)."""
-    return u + k * u**2
+def quadratic(u: SX, *, k: SX = param(each, "1/[u]"), at: SX = constant(0.0)) -> SX:
+    """Second-order response of each axis (Batista, eq. 2).
+
+    About the middle `at` of a recorded input that is far from zero, as a temperature in kelvin, and
+    so are the others: the gain is that in the middle, not at a zero that nothing came near to.
+    """
+    return u + k * (u - at) ** 2
 
 
 @effect(
     on="input",
     typical={"k": 2e-4},
     shown_by="inputs of several sizes and both signs on each axis",
-    formula="u + k·u·|u|",
+    formula="u + k·(u − at)·|u − at|",
+    numbers={"at": "middle"},
 )
-def signed_quadratic(u: SX, *, k: SX = param(each, "1/[u]")) -> SX:
-    """Odd second-order response k·u·|u| (IEEE Std 1293, odd quadratic)."""
-    return u + k * u * fabs(u)
+def signed_quadratic(u: SX, *, k: SX = param(each, "1/[u]"), at: SX = constant(0.0)) -> SX:
+    """Odd second-order response k·u·|u| (IEEE Std 1293, odd quadratic), or about `at`."""
+    return u + k * (u - at) * fabs(u - at)
 
 
 @effect(
     on="input",
     typical={"k": 2e-5},
     shown_by="inputs up to the end of the range, of both signs",
-    formula="u + k·u³",
+    formula="u + k·(u − at)³",
+    numbers={"at": "middle"},
 )
-def cubic(u: SX, *, k: SX = param(each, "1/([u])^2")) -> SX:
-    """Third-order response of each axis (IEEE Std 1293, K3)."""
-    return u + k * u**3
+def cubic(u: SX, *, k: SX = param(each, "1/([u])^2"), at: SX = constant(0.0)) -> SX:
+    """Third-order response of each axis (IEEE Std 1293, K3), or about `at`."""
+    return u + k * (u - at) ** 3
 
 
 @effect(
     on="input",
     typical={"k": 2e-5},
     shown_by="inputs up to the end of the range, of both signs",
-    formula="u + k·|u|³",
+    formula="u + k·|u − at|³",
+    numbers={"at": "middle"},
 )
-def signed_cubic(u: SX, *, k: SX = param(each, "1/([u])^2")) -> SX:
-    """Even third-order response k·|u|³."""
-    return u + k * fabs(u) ** 3
+def signed_cubic(u: SX, *, k: SX = param(each, "1/([u])^2"), at: SX = constant(0.0)) -> SX:
+    """Even third-order response k·|u|³, or about `at`."""
+    return u + k * fabs(u - at) ** 3
 
 
 @effect(

@@ -125,7 +125,7 @@ def trials(model: Model, catalogue: Sequence[Effect]) -> list[Trial]:
             or effect.on == RECORDED
         ):
             continue
-        if effect.profile or effect.columns or effect.numbers:
+        if effect.profile or effect.columns or any(w != "middle" for _, w in effect.numbers):
             continue
         try:
             extended = model.with_effect(placed_in(effect, model))

@@ -117,7 +117,7 @@ def formula_of(attached: Attached) -> str:
     for name, declared in attached.effect.declarations:
         if isinstance(declared, Constant) and not declared.dims:
             formula = re.sub(rf"\b{name}\b", f"{float(declared.array):.6g}", formula)
-    return formula
+    return re.sub(r"\((\w+) − 0\)|\b(\w+) − 0\b(?!\.)", r"\1\2", formula)
 
 
 def _formulas(model: Model, names: Sequence[str]) -> Iterator[str]:

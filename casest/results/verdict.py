@@ -14,7 +14,7 @@ from casest.diagnose.formula.search import NAME as FORMULA
 from casest.diagnose.found import HELD_OUT_DATA
 from casest.diagnose.levels import LEVELS
 from casest.effects import CATALOGUE
-from casest.effects.placing import MISSING, STRAIGHT, UNTIMED
+from casest.effects.placing import MISSING, UNTIMED
 from casest.results.closing import Closed, Effect, Shifts, Unexplained
 from casest.results.fitted import NoiseModel, Samples
 from casest.results.result import Parameter
@@ -47,7 +47,7 @@ def sentence(result: Closed) -> str:
         said = f"nothing that {few or 'these data'} can show is missing"
         if not names and not result.smallest_detectable:
             said = f"nothing is found; {len(result.not_tried)} effects do not apply here"
-        elif any(s.reason.endswith((MISSING["input"], STRAIGHT)) for s in result.not_tried):
+        elif any(s.reason.endswith(MISSING["input"]) for s in result.not_tried):
             said = "nothing that was tried is missing; bends were not (see below)"
         noise = f"; {', '.join(names)} belong to the noise" if names else ""
         over = result.noise.correlated_over_samples or 1
@@ -205,7 +205,7 @@ def untried(result: Closed) -> Iterator[str]:
         verb = "were" if len(names) > 1 else "was"
         yield f"{', '.join(names)} {verb} not tried: {reason}"
     left = {s.name: s.reason for s in result.not_tried if s not in own}
-    for why in (*MISSING.values(), UNTIMED, STRAIGHT):
+    for why in (*MISSING.values(), UNTIMED):
         names = [name for name, reason in left.items() if reason.endswith(why)]
         if names:
             yield f"not tried: {', '.join(names)}: {left[names[0]]}"

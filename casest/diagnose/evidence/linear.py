@@ -120,9 +120,11 @@ class Linear:
 
 
 def alike(fits: Sequence[Linear]) -> list[Linear]:
-    """Fits to be compared: where noise of the inputs counts in one it counts in all, and to the same
-    rows, without those that one of them has nothing to say of: a lag leaves some whose cause nobody
-    recorded."""
+    """Fits that are compared: where noise of the inputs counts in one it counts in all.
+
+    And to the same rows, without those that one of them has nothing to say of: a lag leaves some
+    whose cause nobody recorded.
+    """
     counts = any(fit.counts for fit in fits)
     fits = [fit if fit.counts == counts else replace(fit, counts=counts) for fit in fits]
     if len({fit.residual.shape for fit in fits}) > 1:

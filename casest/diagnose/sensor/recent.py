@@ -18,9 +18,7 @@ class Recent(Generic[K, V]):
 
     def of(self, key: K, computed: Callable[[], V]) -> V:
         """The value of a key, computed where it is not known any more."""
-        for known, value in self._known:
-            if known is key:
-                return value
-        value = computed()
-        self._known = [*self._known, (key, value)][-self._most :]
-        return value
+        others = [pair for pair in self._known if pair[0] is not key]
+        own = [pair for pair in self._known if pair[0] is key] or [(key, computed())]
+        self._known = [*others, *own][-self._most :]
+        return own[0][1]

@@ -30,7 +30,7 @@ class Rows:
     """Rows of runs (prepared), chosen evenly, and fits as linear problems in them."""
 
     runs: tuple[Run, ...]
-    _linears: Recent[Fit, Linear] = field(default_factory=Recent, repr=False)
+    _linears: Recent[Fit, Linear] = field(default_factory=lambda: Recent(16), repr=False)
     _settled: Recent[Fit, NDArray[np.bool_]] = field(default_factory=Recent, repr=False)
 
     def linear(self, fit: Fit) -> Linear:

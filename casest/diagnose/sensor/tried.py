@@ -37,13 +37,11 @@ from casest.effects import shipped
 from casest.effects.kinds import foreign, readings
 from casest.effects.lateness import comes_again, likely_lag
 from casest.effects.on_axes import restricted
-from casest.effects.placing import STRAIGHT, UNTIMED, placed_in
+from casest.effects.placing import UNTIMED, placed_in
 from casest.errors import CasestError
 
 #: Why what remembers is not tried.
 BEGUN_ANEW = "each pose begins anew: nothing is remembered from the one before"
-#: Range of what a sensor met, in its size, below which a bend may be a straight line.
-FAR = 0.1
 #: Samples of a block up to which it is a pose.
 LONGEST_POSE = 32
 
@@ -276,9 +274,7 @@ class Tried:
         """What is asked for and these data cannot show; and what of it does not apply to them."""
         found, skipped = self.found(fit)
         hidden = [c for c in found if self.asked(c) and c.label not in shown]
-        straight = {s.name: s.reason for s in self.straight(fit, shown)}
-        nothing = "these data cannot show it"
-        silent = [Skipped(c.label, straight.get(c.label, nothing)) for c in hidden]
+        silent = [Skipped(c.label, "these data cannot show it") for c in hidden]
         of_noise = {e.name for e in self.catalogue if e.on == NOISE}
         tried = {name for c in found for name in (c.name, c.label)}
         absent = []
@@ -287,18 +283,6 @@ class Tried:
             why = reasons[0] if reasons else "the data have no column that it could follow"
             absent.append(Skipped(name, why))
         return silent, absent
-
-    def straight(self, fit: Fit, shown: Collection[str]) -> list[Skipped]:
-        """Bends of one input that are none here, since it lies far from zero for its range."""
-        met = self.rows.met(fit)
-        if met.shape[1] > 1 or np.ptp(met) >= FAR * np.abs(met).mean():
-            return []
-        found = []
-        for trial in (t for t in self.trials(fit) if t.family not in shown and bend(t.what)):
-            size, least = trial.columns.reshape(len(met), -1) / met, LEVELS.survives
-            if trial.what.effect is not None and np.ptp(size) > least * np.abs(size).max():
-                found.append(Skipped(trial.family, STRAIGHT))
-        return found
 
 
 def _axes(fit: Fit, candidate: Candidate, count: int) -> Index | None:
