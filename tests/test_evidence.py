@@ -27,7 +27,7 @@ from casest.diagnose.evidence.score import (
     shift,
 )
 from casest.diagnose.levels import LEVELS
-from casest.diagnose.noise.louder import louder
+from casest.diagnose.noise.louder import louder, most_there
 from casest.diagnose.protocol import pairs, ranked_of
 
 
@@ -254,6 +254,40 @@ def test_of_white_noise_hardly_a_block_is_called_louder():
     rng = np.random.default_rng(9)
     found = louder(rng.standard_normal((40_000, 1)), (slice(0, 40_000),))
     assert np.mean(found > 1) < 0.005
+
+
+def _best_window(residual):
+    """What is left beside the mean of the window that takes most of the squares, by NumPy."""
+    n, best = len(residual), (0.0, residual)
+    sums = np.concatenate([np.zeros((1, residual.shape[1])), np.cumsum(residual, axis=0)])
+    for width in range(3, 40):
+        taken = np.sum((sums[width:] - sums[:-width]) ** 2, axis=1) / width
+        first = int(taken.argmax())
+        if taken[first] > best[0]:
+            after = residual.copy()
+            after[first : first + width] -= residual[first : first + width].mean(axis=0)
+            best = taken[first], after
+    return best[1]
+
+
+@pytest.mark.parametrize("pulse", [0.0, 30.0])
+def test_in_a_burst_of_noise_the_largest_readings_are_on_one_side_somewhere(pulse):
+    """13 rows of 400 are ten times louder: the best window of it gains hundreds beside the noise
+    elsewhere. A pulse of six times the burst's own noise is one, and so is one in quiet rows."""
+    worth, plain, quiet = [], [], []
+    for seed in range(60):
+        residual = np.random.default_rng(seed).standard_normal((400, 3))
+        residual[200:213] = 10 * residual[200:213] + pulse * np.array([1, -1, 2])
+        after = _best_window(residual)
+        plain.append(np.sum(residual**2) - np.sum(after**2))
+        worth.append(most_there(residual, after))
+        residual[200:213] /= 10
+        residual[100:130] += 3
+        quiet.append(most_there(residual, _best_window(residual)))
+    price = 3 * np.log(1200) + 2 * np.log(37 * 400)  # of three unknowns, and of all windows
+    assert np.quantile(plain, 0.1) > price + 100
+    assert np.all(np.isinf(quiet))
+    assert min(worth) > price + LEVELS.strong if pulse else max(worth) < price
 
 
 # -- price -----------------------------------------------------------------------------------------

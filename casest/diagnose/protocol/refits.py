@@ -22,10 +22,10 @@ from casest.diagnose.evidence.score import (
     with_chance,
 )
 from casest.diagnose.levels import LEVELS
-from casest.diagnose.noise.louder import louder
+from casest.diagnose.noise.louder import louder, most_there
 from casest.diagnose.protocol.confirming import falls, falls_of_refit, falls_with, holds_out
 from casest.diagnose.protocol.ranking import sharpened, without_feigned
-from casest.diagnose.protocol.state import F, Ranking, Refit, State
+from casest.diagnose.protocol.state import LOUDER, F, Ranking, Refit, State
 from casest.diagnose.protocol.subject import Subject
 
 #: Why a cause in poses is not added.
@@ -59,7 +59,7 @@ def refitted(
             fits.append((evidence, better))
     refits = [fit for _, fit in fits]
     gains = subject.rises(state.fit, refits) if fits else []
-    even = _where_noise_is_louder(subject, ranking, refits) or gains
+    even = _where_noise_is_louder(subject, ranking, refits, gains)
     slow = (refits and subject.rises_beside_a_wander(state.fit, refits)) or gains
     found: list[Refit[F]] = []
     asked = max(sum(subject.asked(e.trials[0].what) for e, _ in fits), 1)
@@ -67,8 +67,9 @@ def refitted(
         evidence = _charged(subject, state.fit, evidence, better)
         kept = _gaining(evidence, gain)
         if subject.asked(evidence.trials[0].what):
-            kept = with_chance(kept, ranking.likelihood, asked)
-            plain = _gaining(evidence, gain + evidence.feigned)
+            least = min(gain, noisier[0])
+            kept = with_chance(_gaining(evidence, least), ranking.likelihood, asked)
+            plain = _gaining(evidence, least + evidence.feigned)
             chance = with_chance(plain, ranking.likelihood, asked).p_value
             why = NONE_OF_IT.format(chance) if chance >= LEVELS.chance else ""
             why = why or _refused(kept, subject.linear(state.fit), subject.linear(better))
@@ -86,7 +87,8 @@ def refitted(
         elif few:
             state = state.failing(evidence, few)
         elif len(evidence.trials) == 1 and _strong(ranking, kept):
-            state = state.refusing(evidence.trials[0].what, AS_MUCH)
+            loud = not _strong(ranking, _gaining(evidence, noisier[0]))
+            state = state.refusing(evidence.trials[0].what, LOUDER if loud else AS_MUCH)
     found.sort(key=lambda r: -r.evidence.score)
     near = [r.evidence for r in _near(found)]
     if len(near) > 1:
@@ -145,18 +147,22 @@ def _gaining(evidence: Evidence, gain: float) -> Evidence:
     return replace(evidence, gain=gain, score=evidence.score - evidence.gain + gain)
 
 
-def _where_noise_is_louder(subject: Subject[F], ranking: Ranking, fits: Sequence[F]) -> list[float]:
-    """The gains of refits where readings in bursts of noise count as less; none without bursts.
+def _where_noise_is_louder(
+    subject: Subject[F], ranking: Ranking, fits: Sequence[F], gains: Sequence[float]
+) -> list[float]:
+    """The gains of refits where readings in bursts of noise count as less; as they are without.
 
     In a burst of a few readings the largest are on one side by chance, and any event is seen.
     """
-    size = louder(ranking.linear.residual, ranking.linear.spans)
-    if not fits or np.all(size == 1):
-        return []
-    after = [subject.linear(fit) for fit in fits]
-    if any(x.residual.shape != ranking.linear.residual.shape for x in after):
-        return []
-    return rises(ranking.linear.evened(size), [x.evened(size) for x in after])
+    before, after = ranking.linear, [subject.linear(fit) for fit in fits]
+    same = [x.residual.shape == before.residual.shape for x in after]
+    if not before.series or not after or not all(same):
+        return list(gains)
+    size = louder(before.residual, before.spans)
+    if np.any(size > 1):
+        gains = rises(before.evened(size), [x.evened(size) for x in after])
+    most = [most_there(before.residual, x.residual) for x in after]
+    return [min(pair) for pair in zip(gains, most, strict=True)]
 
 
 def _strong(ranking: Ranking, evidence: Evidence) -> bool:

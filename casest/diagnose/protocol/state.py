@@ -105,6 +105,8 @@ class Kept:
 #: the model tells itself.
 ANOTHER = "it is another effect"
 STANDS_IN = "its columns stand in their place"
+#: And against what the largest readings in a burst of noise make.
+LOUDER = "noise is louder where it is, and readings there differ from each other by as much"
 
 
 @dataclass(frozen=True)
@@ -161,10 +163,12 @@ class State(Generic[F]):
         return replace(self, kept=others, gone=gone).refusing(kept.what, why)
 
     def unlike(self, evidence: Evidence) -> bool:
-        """Is it a cause that is not what its name says? It explains nothing under that name."""
-        what = evidence.trials[0].what
-        alone = len(evidence.trials) == 1
-        return alone and any(r.another and r.what.label == what.label for r in self.refused)
+        """Is it a cause that is not what its name says, or has one that is a burst of noise? It
+        explains nothing under that name."""
+        labels = {t.what.label for t in evidence.trials}
+        alone = len(labels) == 1
+        named = (r for r in self.refused if r.what.label in labels)
+        return any(r.why == LOUDER or (alone and r.another) for r in named)
 
     def failing(self, evidence: Evidence, why: str) -> State[F]:
         """The state that says of each of these causes why there is no refit with them."""
