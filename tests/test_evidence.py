@@ -13,7 +13,7 @@ from scipy.linalg import solve_triangular, toeplitz
 from scipy.signal import butter, lfilter
 
 from casest import close
-from casest.diagnose.evidence.by_row import chance_by_row
+from casest.diagnose.evidence.by_row import chance_by_row, most_there
 from casest.diagnose.evidence.likelihood import Beyond, Likelihood
 from casest.diagnose.evidence.linear import Linear, parts_of
 from casest.diagnose.evidence.rises import rise_of_squares, rises
@@ -27,7 +27,7 @@ from casest.diagnose.evidence.score import (
     shift,
 )
 from casest.diagnose.levels import LEVELS
-from casest.diagnose.noise.louder import louder, most_there
+from casest.diagnose.noise.louder import louder
 from casest.diagnose.protocol import pairs, ranked_of
 
 
@@ -258,7 +258,7 @@ def test_of_white_noise_hardly_a_block_is_called_louder():
 
 def _best_window(residual):
     """What is left beside the mean of the window that takes most of the squares, by NumPy."""
-    n, best = len(residual), (0.0, residual)
+    best = 0.0, residual
     sums = np.concatenate([np.zeros((1, residual.shape[1])), np.cumsum(residual, axis=0)])
     for width in range(3, 40):
         taken = np.sum((sums[width:] - sums[:-width]) ** 2, axis=1) / width

@@ -308,9 +308,11 @@ def _undecided(sensor: Sensor, state: State[Fit]) -> Undecided | None:
         elif len(evidence.trials) > 1:  # both may stand in for the model where one does not
             parts = {(t.family,): _share(sensor, state, [t]) for t in evidence.trials}
             shares |= {family: one for family, one in parts.items() if one is not None}
-    most = LEVELS.nested * max(shares.values(), default=0.0)
+    most = max(shares.values(), default=0.0)
+    # None that leaves twice as much as the best.
+    least = max(LEVELS.nested * most, 1 - (1 - most) / LEVELS.most)
     several = sorted(shares.items(), key=lambda one: -one[1])
-    shares = {families: share for families, share in several if share >= most}
+    shares = {families: share for families, share in several if share >= least}
     names = tuple(dict.fromkeys(n for families in shares for n in families if n not in there))
     if not names:
         return None

@@ -311,7 +311,7 @@ def fitted_content(
             Samples(run.name, len(run), int(np.sum(run.count)), run.span and list(run.span))
             for run in problem.runs
         ],
-        "notes": [note for run in problem.runs for note in run.notes] + list(estimate.notes),
+        "notes": [*dict.fromkeys(n for run in problem.runs for n in run.notes), *estimate.notes],
         "convention": inspect.getdoc(problem.model.function) or "",
         "declared_in": declared_in(problem.model),
         "reproduce": reproduced(command, data),

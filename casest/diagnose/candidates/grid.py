@@ -239,14 +239,16 @@ def _pulses(seen: Seen) -> Values:
     first, last = int(a[best]), int(b[best])
     reach = max(2, n // EDGES)
     for _ in range(2):
-        near = np.arange(max(1, first - reach), min(last - edge, first + reach) + 1)
+        near = np.arange(max(edge, first - reach), min(last - edge, first + reach) + 1)
         if len(near):
             first = int(near[np.argmax(gain(near, np.full_like(near, last)))])
-        near = np.arange(max(first + edge, last - reach), min(n - 1, last + reach) + 1)
+        near = np.arange(max(first + edge, last - reach), min(n - edge, last + reach) + 1)
         if len(near):
             last = int(near[np.argmax(gain(np.full_like(near, first), near))])
     even = np.linspace(0, n, PULSES + 1).astype(int)[1:-1]
-    pairs = {(first, last)} | {(int(i), int(j)) for i in even for j in even if i < j}
+    pairs = {(int(i), int(j)) for i in even for j in even if i < j}
+    if edge < first and last < n - edge:  # else it is one step, and what begins or ends a record
+        pairs.add((first, last))
     return [(_between(time, i), _between(time, j)) for i, j in sorted(pairs)], n * n / 2
 
 

@@ -3,7 +3,7 @@ neighbours go together; in a series, whether more than a few do.
 
 The classical F test takes every row's error to be of one size and for itself. A row that is off
 alone, noise that is larger at one end, or a sweep in which each reading is off as the one before
-it, make an effect of whatever is largest there.
+it, make an effect of whatever is largest there. So does a burst of noise.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from casest.declaration.shapes import Array
-from casest.diagnose.evidence.linear import Linear
+from casest.diagnose.evidence.linear import Linear, robust_sd
 from casest.diagnose.levels import LEVELS
 
 #: Correlation of neighbours at most: of few rows nobody can tell more from it.
@@ -117,3 +117,30 @@ def carried_by_few(before: Linear, after: Linear) -> bool:
     moved = np.sum((before.residual - after.residual) ** 2, axis=1)
     most = np.sort(moved)[-max(1, int(np.ceil(FEW * len(moved)))) :]
     return bool(most.sum() > (1 - LEVELS.alike) * moved.sum())
+
+
+def most_there(before: Array, after: Array) -> float:
+    """The most that a refit can be worth, `before` to `after` (N, m), where few rows hold most of
+    what it takes and noise is louder in these: 2 log of the likelihood ratio with a size of the
+    noise of their own. Infinite where it is not so.
+
+    In a burst of noise the largest readings are on one side somewhere.
+    """
+    size = np.maximum(robust_sd(after), 1e-300)
+    moved = np.sum(((before - after) / size) ** 2, axis=1)
+    order = np.argsort(-moved, kind="stable")
+    held = np.cumsum(moved[order]) <= (1 - LEVELS.alike) * moved.sum()
+    there = order[: max(1, int(held.sum()))]
+    if len(there) > LEVELS.most * len(after):
+        return np.inf
+    left = np.abs(after / size)
+    own, elsewhere = left[there], np.delete(left, there, axis=0)
+    if _rms(own) <= LEVELS.louder * _rms(elsewhere):
+        return np.inf
+    ratio = float(np.sum((before[there] / size) ** 2)) / max(float(np.sum(own**2)), 1e-300)
+    return own.size * float(np.log(max(ratio, 1.0))) / (1 - LEVELS.alike)
+
+
+def _rms(left: Array) -> float:
+    """Of absolute values, those far out of the most brought near."""
+    return float(np.sqrt(np.mean(np.minimum(left, LEVELS.far * np.median(left)) ** 2)))

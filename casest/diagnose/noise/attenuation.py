@@ -43,7 +43,10 @@ def attenuated(estimate: Estimate) -> Iterator[tuple[str, float, Mapping[str, fl
             if problem.weights is not None:
                 noisy = noisy.with_weights(problem.weights)
             _, gradient, matrix = noisy.normal(noisy.point(estimate.values))
-            steps.append(np.linalg.lstsq(matrix, -gradient, rcond=1e-12)[0])
+            if np.isfinite(gradient).all() and np.isfinite(matrix).all():
+                steps.append(np.linalg.lstsq(matrix, -gradient, rcond=1e-12)[0])
+        if len(steps) < draws:  # the model has no value there: a logarithm below zero
+            continue
         moved, scatter = np.mean(steps, axis=0), np.std(steps, axis=0) / np.sqrt(draws)
         std = np.sqrt(np.diag(estimate.covariance)) + scatter
         far = {

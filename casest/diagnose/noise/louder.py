@@ -8,7 +8,6 @@ from itertools import pairwise
 import numpy as np
 
 from casest.declaration.shapes import Array
-from casest.diagnose.evidence.linear import robust_sd
 from casest.diagnose.levels import LEVELS
 
 
@@ -31,33 +30,6 @@ def louder(residual: Array, spans: Sequence[slice]) -> Array:
         if size > LEVELS.louder:
             found[block] = size
     return found
-
-
-def most_there(before: Array, after: Array) -> float:
-    """The most that a refit can be worth, `before` to `after` (N, m), where few rows hold most of
-    what it takes and noise is louder in these: 2 log of the likelihood ratio with a size of the
-    noise of their own. Infinite where it is not so.
-
-    In a burst of noise the largest readings are on one side somewhere.
-    """
-    size = np.maximum(robust_sd(after), 1e-300)
-    moved = np.sum(((before - after) / size) ** 2, axis=1)
-    order = np.argsort(-moved, kind="stable")
-    held = np.cumsum(moved[order]) <= (1 - LEVELS.alike) * moved.sum()
-    there = order[: max(1, int(held.sum()))]
-    if len(there) > LEVELS.most * len(after):
-        return np.inf
-    left = np.abs(after / size)
-    own, elsewhere = left[there], np.delete(left, there, axis=0)
-    if _rms(own) <= LEVELS.louder * _rms(elsewhere):
-        return np.inf
-    ratio = float(np.sum((before[there] / size) ** 2)) / max(float(np.sum(own**2)), 1e-300)
-    return own.size * float(np.log(max(ratio, 1.0))) / (1 - LEVELS.alike)
-
-
-def _rms(left: Array) -> float:
-    """Of absolute values, those far out of the most brought near."""
-    return float(np.sqrt(np.mean(np.minimum(left, LEVELS.far * np.median(left)) ** 2)))
 
 
 def _blocks(span: slice) -> list[slice]:

@@ -8,7 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from casest.declaration.shapes import Array
-from casest.diagnose.evidence.by_row import carried_by_few, chance_by_row, chance_together
+from casest.diagnose.evidence.by_row import (
+    carried_by_few,
+    chance_by_row,
+    chance_together,
+    most_there,
+)
 from casest.diagnose.evidence.input_noise import at_most, feigned_by_refit
 from casest.diagnose.evidence.linear import Linear, alike
 from casest.diagnose.evidence.rises import of_squares, rises
@@ -22,7 +27,7 @@ from casest.diagnose.evidence.score import (
     with_chance,
 )
 from casest.diagnose.levels import LEVELS
-from casest.diagnose.noise.louder import louder, most_there
+from casest.diagnose.noise.louder import louder
 from casest.diagnose.protocol.confirming import falls, falls_of_refit, falls_with, holds_out
 from casest.diagnose.protocol.ranking import sharpened, without_feigned
 from casest.diagnose.protocol.state import LOUDER, F, Ranking, Refit, State
@@ -67,9 +72,9 @@ def refitted(
         evidence = _charged(subject, state.fit, evidence, better)
         kept = _gaining(evidence, gain)
         if subject.asked(evidence.trials[0].what):
-            least = min(gain, noisier[0])
-            kept = with_chance(_gaining(evidence, least), ranking.likelihood, asked)
-            plain = _gaining(evidence, least + evidence.feigned)
+            gain = min(gain, noisier[0])
+            kept = with_chance(_gaining(evidence, gain), ranking.likelihood, asked)
+            plain = _gaining(evidence, gain + evidence.feigned)
             chance = with_chance(plain, ranking.likelihood, asked).p_value
             why = NONE_OF_IT.format(chance) if chance >= LEVELS.chance else ""
             why = why or _refused(kept, subject.linear(state.fit), subject.linear(better))
@@ -112,14 +117,14 @@ def _refused(evidence: Evidence, before: Linear, after: Linear) -> str:
 
 
 def _by_few_rows(subject: Subject[F], ranking: Ranking, evidence: Evidence, fit: F) -> str:
-    """Why it is none where it hangs on a few rows; empty where it is seen in poses whatever the
-    sizes of their errors are, in a series in many rows."""
+    """Why it is none where it hangs on a few rows; empty where it is seen whatever the sizes of
+    their errors are, what is there in every row of a series in many of them."""
     after = subject.linear(fit)
     if after.residual.shape != ranking.linear.residual.shape:
         return ""
-    if ranking.linear.series:
-        influence = all(subject.everywhere(t.what) for t in evidence.trials)
-        return FEW_OF_MANY if influence and carried_by_few(ranking.linear, after) else ""
+    influence = all(subject.everywhere(t.what) for t in evidence.trials)
+    if ranking.linear.series and influence and carried_by_few(ranking.linear, after):
+        return FEW_OF_MANY
     chance = chance_by_row(ranking.linear, after)
     chance = shared_chance(chance, evidence, ranking.families)
     return "" if chance < LEVELS.chance else FEW_ROWS.format(chance)
@@ -130,7 +135,8 @@ def _charged(subject: Subject[F], before: F, evidence: Evidence, fit: F) -> Evid
     gain = feigned_between(subject, before, fit)
     if gain is None:
         return evidence
-    own = at_most(gain, evidence.explained.left.size) / len(evidence.trials)
+    most = min(at_most(gain, evidence.explained.left.size), subject.most_feigned(before, fit))
+    own = most / len(evidence.trials)
     return replace(evidence, trials=tuple(replace(t, feigned=own) for t in evidence.trials))
 
 

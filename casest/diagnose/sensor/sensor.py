@@ -33,13 +33,14 @@ from casest.diagnose.sensor.fits import (
 from casest.diagnose.sensor.jitter import Draw, in_refit, jittered
 from casest.diagnose.sensor.recent import Recent
 from casest.diagnose.sensor.rows import Rows
-from casest.diagnose.sensor.to_both_sides import to_both_sides
+from casest.diagnose.sensor.to_both_sides import most_feigned, to_both_sides
 from casest.diagnose.sensor.tried import Tried, on_axes
 from casest.diagnose.sensor.twins import bend
 from casest.diagnose.sensor.unlike import (
     another,
     at_one_input,
     between_levels,
+    smooth,
     stands_in,
     too_slow,
 )
@@ -137,6 +138,10 @@ class Sensor(Subject[Fit]):
         """What noise of each input adds to the residuals of two fits."""
         return in_refit(self.rows, before, after)
 
+    def most_feigned(self, before: Fit, after: Fit) -> float:
+        """What a mean of rows to both sides gains, where a memory was added."""
+        return most_feigned(before, after, self.rows)
+
     def nearer(self, fit: Fit, trial: Trial, scale: float) -> list[Trial]:
         """Values of a grid around the trial's."""
         return self.tried.nearer(fit, trial, scale)
@@ -187,6 +192,7 @@ class Sensor(Subject[Fit]):
             or stands_in(before, after, [w for w in added if not self.asked(w)], self.rows)
             or driven(before, after, added, self.rows)
             or to_both_sides(before, after, added, self.rows)
+            or smooth(self.linear(before), self.linear(after), added, self.rows.met(before))
         )
         bends = [t for t in trials if bend(t.what)] if self.linear(before).series else []
         if bends and not why:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from casest.data.run import Run
+from casest.declaration.effect import OVER_TIME
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import Candidate
@@ -21,18 +23,25 @@ from casest.diagnose.sensor.fits import Fit, problem_of
 from casest.diagnose.sensor.rows import Rows, instant
 from casest.leastsquares.problem import Problem
 
+#: Powers of what the sensor met, of which the best are a smooth bend.
+POWERS = range(2, 9)
+#: What a grid is searched for of an effect with a kink in what the sensor met.
+KINKS = {"level", "floor", "threshold", "band"}
+
 
 def another(model: Model, values: Mapping[str, Array], declared: Model) -> tuple[str, str]:
     """Label of an effect that is not what its name says at these values, and why; else empty.
 
     Of axes that have sizes of their own the largest decides. What the `declared` model has already
-    is the user's word.
+    is the user's word. A memory of an implicit model takes back what the sensor did: its sizes have
+    the other sign.
     """
     given = {a.label for a in declared.effects}
     for attached in (a for a in model.effects if a.label not in given):
         for name, (least, most) in attached.effect.within:
             own = [v for n, v in values.items() if _is_of(n, attached.label, name)]
-            size = max((float(np.max(v)) for v in own), default=most)
+            back = -1.0 if model.implicit and attached.kind in OVER_TIME else 1.0
+            size = max((float(np.max(back * v)) for v in own), default=most)
             if not least <= size <= most:
                 beyond = f"above {most:g}" if size > most else f"below {least:g}"
                 why = f"{attached.label} would have {name} = {size:.3g}, {beyond}"
@@ -55,6 +64,31 @@ def at_one_input(what: Candidate, beyond: Array) -> str:
     if size > 0 and len(np.unique(np.round(beyond[beyond != 0] / size, 6))) < 2:
         return f"one input alone lies beyond the level of {what.label}"
     return ""
+
+
+def smooth(before: Linear, after: Linear, added: Sequence[Candidate], met: Array) -> str:
+    """Why a kink is none: over what the sensor met (N, 1) a smooth bend of as many unknowns leaves
+    less; else empty."""
+    kinks = [w for w in added if w.effect is not None and KINKS & {k for _, k in w.effect.profile}]
+    alone = bool(kinks) and len(added) == 1 and met.shape[1] == 1
+    if not alone or before.residual.shape != after.residual.shape:
+        return ""
+    z = (met - met.mean()) / max(float(np.abs(met - met.mean()).max()), 1e-300)
+    powers = np.concatenate([(z**k * before.root).reshape(-1, 1) for k in POWERS], axis=1)
+    Q, r = before.basis, before.residual.ravel()
+    beyond = powers - Q @ (Q.T @ powers)
+    size = np.linalg.norm(beyond, axis=0)
+    kept = size > LEVELS.survives * np.linalg.norm(powers, axis=0)  # those that it has not already
+    beyond = beyond[:, kept] / size[kept]
+    square, product = beyond.T @ beyond, beyond.T @ r
+    count = after.slopes.shape[2] - before.slopes.shape[2]
+    gains = [0.0]
+    for own in map(list, combinations(range(int(kept.sum())), count)):
+        best = np.linalg.lstsq(square[np.ix_(own, own)], product[own], rcond=1e-9)[0]
+        gains.append(float(product[own] @ best))
+    if float(r @ r) - max(gains) >= float(np.sum(after.residual**2)):
+        return ""
+    return f"a smooth bend of as many unknowns leaves less than a kink: {ANOTHER}"
 
 
 def too_slow(
