@@ -35,15 +35,15 @@ def averages(problem: Problem, point: Point) -> list[Array] | None:
     return found
 
 
-def best_mean(residual: Array, basis: Array, columns: Array) -> Array:
+def best_mean(residual: Array, basis: Array, columns: Array) -> Array | None:
     """Of residuals (N, m) beside unknowns with an orthonormal `basis` (N·m, p), what the best mean
-    takes away (N, m): no row has a weight below zero in it."""
+    takes away (N, m): no row has a weight below zero in it. None where it takes nothing."""
     from scipy.optimize import nnls
 
     flat = columns.reshape(residual.size, -1)
     Q, R = np.linalg.qr(flat - basis @ (basis.T @ flat))
     weights, _ = nnls(R, Q.T @ residual.ravel())
-    return np.asarray((flat @ weights).reshape(residual.shape))
+    return (flat @ weights).reshape(residual.shape) if np.any(weights) else None
 
 
 def _of_stretch(x: Array) -> Array:

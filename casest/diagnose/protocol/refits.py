@@ -135,8 +135,7 @@ def _charged(subject: Subject[F], before: F, evidence: Evidence, fit: F) -> Evid
     gain = feigned_between(subject, before, fit)
     if gain is None:
         return evidence
-    most = min(at_most(gain, evidence.explained.left.size), subject.most_feigned(before, fit))
-    own = most / len(evidence.trials)
+    own = at_most(gain, evidence.explained.left.size) / len(evidence.trials)
     return replace(evidence, trials=tuple(replace(t, feigned=own) for t in evidence.trials))
 
 

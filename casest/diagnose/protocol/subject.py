@@ -51,10 +51,6 @@ class Subject(Protocol[F]):
         residuals (N, m) of two fits."""
         return ()
 
-    def most_feigned(self, before: F, after: F) -> float:
-        """The most that noise of the inputs may gain of what was added, whatever its size."""
-        return float("inf")
-
     def nearer(self, fit: F, trial: Trial, scale: float) -> Sequence[Trial]:
         """Variants of a trial around its value on a grid."""
         return ()

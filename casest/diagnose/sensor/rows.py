@@ -42,15 +42,16 @@ class Rows:
         met = self.met(fit)
         parts, held = parts_of(*self._numbers, met), plateaus_of(met, self._spans)
         found = Linear(residual, J, self._spans, parts, self._least(fit), held, roots)
-        mean = self.best_mean(fit, found) if self._spans else None
+        mean = self.best_mean(fit, found)
         if mean is None:
             return found
         most = share_taken(found, mean) > LEVELS.most
         return replace(found, feigned=mean[:, :, None], counts=most)
 
     def best_mean(self, fit: Fit, linear: Linear) -> Array | None:
-        """What the best mean of inputs over rows before and after takes away (N, m); None where
-        there are no such means."""
+        """What the best mean of inputs over rows before and after takes away (N, m)."""
+        if not self._spans:
+            return None
         found = averages(*problem_of(fit, self.runs))
         if found is None:
             return None

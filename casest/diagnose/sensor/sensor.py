@@ -33,7 +33,7 @@ from casest.diagnose.sensor.fits import (
 from casest.diagnose.sensor.jitter import Draw, in_refit, jittered
 from casest.diagnose.sensor.recent import Recent
 from casest.diagnose.sensor.rows import Rows
-from casest.diagnose.sensor.to_both_sides import most_feigned, to_both_sides
+from casest.diagnose.sensor.to_both_sides import to_both_sides
 from casest.diagnose.sensor.tried import Tried, on_axes
 from casest.diagnose.sensor.twins import bend
 from casest.diagnose.sensor.unlike import (
@@ -137,10 +137,6 @@ class Sensor(Subject[Fit]):
     ) -> Sequence[Sequence[tuple[float, Array, Array, Array]]]:
         """What noise of each input adds to the residuals of two fits."""
         return in_refit(self.rows, before, after)
-
-    def most_feigned(self, before: Fit, after: Fit) -> float:
-        """What a mean of rows to both sides gains, where a memory was added."""
-        return most_feigned(before, after, self.rows)
 
     def nearer(self, fit: Fit, trial: Trial, scale: float) -> list[Trial]:
         """Values of a grid around the trial's."""

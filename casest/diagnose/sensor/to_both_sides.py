@@ -13,10 +13,9 @@ from dataclasses import replace
 import numpy as np
 
 from casest.declaration.effect import OVER_TIME
-from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import Candidate
 from casest.diagnose.evidence.held_out import share_taken
-from casest.diagnose.evidence.linear import Linear, alike
+from casest.diagnose.evidence.linear import alike
 from casest.diagnose.protocol.state import ANOTHER
 from casest.diagnose.sensor.fits import Fit
 from casest.diagnose.sensor.rows import Rows
@@ -27,31 +26,15 @@ def to_both_sides(before: Fit, after: Fit, added: Sequence[Candidate], rows: Row
     if not any(what.effect is not None and what.effect.kind in OVER_TIME for what in added):
         return ""
     one, other = alike([rows.linear(before), rows.linear(after)])
-    if one.feigned is None or one.residual.shape != other.residual.shape:
+    mean = rows.best_mean(before, one) if one.residual.shape == other.residual.shape else None
+    if mean is None:
         return ""
-    if _left(one, one.feigned) > float(np.sum(other.residual**2)):
+    Q = replace(one, feigned=mean[:, :, None], counts=True).basis
+    r = one.residual.ravel()
+    left = r - Q @ (Q.T @ r)
+    if float(np.sum(left**2)) > float(np.sum(other.residual**2)):
         return ""
     return f"noise of the inputs, averaged over rows before and after, does as well: {ANOTHER}"
-
-
-def most_feigned(before: Fit, after: Fit, rows: Rows) -> float:
-    """The most that noise of the inputs gains where a memory is added: no more than the best mean
-    to both sides (2 log of the likelihood ratio). Infinite of anything else."""
-    known = {attached.label for attached in before.model.effects}
-    if any(a.kind not in OVER_TIME for a in after.model.effects if a.label not in known):
-        return np.inf
-    one = rows.linear(before)
-    mean = rows.best_mean(before, one)
-    if mean is None:
-        return np.inf
-    squares = float(np.sum(one.residual**2))
-    return one.residual.size * float(np.log(squares / max(_left(one, mean[:, :, None]), 1e-300)))
-
-
-def _left(linear: Linear, mean: Array) -> float:
-    """Squares that are left beside a mean (N, m, 1)."""
-    Q, r = replace(linear, feigned=mean, counts=True).basis, linear.residual.ravel()
-    return float(np.sum((r - Q @ (Q.T @ r)) ** 2))
 
 
 def of_inputs(fit: Fit, rows: Rows) -> float:
