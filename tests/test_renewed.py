@@ -184,3 +184,19 @@ def test_of_a_wave_that_comes_again_and_again_the_nearest_lag_counts(tmp_path, l
     runs = load_runs([written(tmp_path / "wave.csv", columns)], SIGNALS)
     found = likely_lag(runs, "reading", "reference", within=True)
     assert abs(found - late) < 0.0008 or abs(found - late - np.copysign(0.005, -late)) < 0.0008
+
+
+def test_a_row_that_the_end_of_a_log_writes_again_keeps_its_time_in_order(tmp_path):
+    """Stamps and all, as a logger that waits does: the other rows have times as they are."""
+    rng = np.random.default_rng(4)
+    new = np.repeat(np.arange(300), rng.integers(1, 4, 300))  # of a source at half the pace
+    t, u, v = 0.01 * np.arange(new.size), rng.uniform(-1, 1, 300)[new], rng.uniform(-1, 1, 300)[new]
+    more = {f"f{k}": rng.standard_normal(300)[new] for k in range(4)}
+    columns = {"t": t, "reference": u, "reading": v, **more}
+    columns = {n: np.concatenate([c, np.repeat(c[-1:], 12)]) for n, c in columns.items()}
+    (run,) = load_runs([written(tmp_path / "log.csv", columns)], SIGNALS)
+    np.testing.assert_allclose(run.time, t[np.concatenate([[True], np.diff(new) > 0])])
+    at = np.flatnonzero(np.diff(new) > 0)[80] + 1  # a reading with the stamp of the row before
+    columns["t"][at] = columns["t"][at - 1]
+    (run,) = load_runs([written(tmp_path / "twice.csv", columns)], SIGNALS)
+    assert run.time is None

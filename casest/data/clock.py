@@ -55,7 +55,7 @@ class Clock:
 
         Its first sample is t = 0, unless the column's own zero is wanted.
         """
-        time, notes = self._of_rows(table, rows, signals, options)
+        time, notes = self._of_rows(table, rows, complete[rows], signals, options)
         if time is None:
             return None, notes
         time = time[complete[rows]]
@@ -66,11 +66,16 @@ class Clock:
         return time - time[0], [said, *notes] if of_column else notes
 
     def _of_rows(
-        self, table: Table, rows: NDArray[np.int_], signals: Sequence[Signal], options: Options
+        self,
+        table: Table,
+        rows: NDArray[np.int_],
+        complete: NDArray[np.bool_],
+        signals: Sequence[Signal],
+        options: Options,
     ) -> tuple[Array | None, list[str]]:
         needed = any(is_time(signal) for signal in signals)
         if self.time is not None:
-            return self._from_column(table, rows, needed=needed)
+            return self._from_column(table, rows, complete, needed=needed)
         if options.rate is not None:
             return np.arange(len(rows)) / options.rate, []
         if stated := timing.rate_in_preamble(table):
@@ -86,11 +91,13 @@ class Clock:
         return None, []
 
     def _from_column(
-        self, table: Table, rows: NDArray[np.int_], *, needed: bool
+        self, table: Table, rows: NDArray[np.int_], complete: NDArray[np.bool_], *, needed: bool
     ) -> tuple[Array | None, list[str]]:
         assert self.time is not None
         time = self.time[rows]
-        there = np.isfinite(time)
+        # A row that is left out as written again has the stamp of the one before, if it is so.
+        again = ~complete & np.concatenate([[False], np.diff(time) == 0])
+        there = np.isfinite(time) & ~again
         try:
             stamps.refuse_unordered(table.file, self._name, time[there], rows[there])
         except DataError as error:
