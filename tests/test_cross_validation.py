@@ -271,7 +271,7 @@ def test_what_a_user_declares_is_judged_by_its_own_test(seed):
     closing = close(line, [nothing], catalogue=[switched])
     assert names(closing) == []
     (said,) = refusals(closing)
-    assert said.startswith("no more of it than noise would have")
+    assert said.startswith("no more of it than noise like what is left")
 
 
 @pytest.mark.parametrize("records", [60, pytest.param(400, marks=pytest.mark.long)])

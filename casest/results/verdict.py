@@ -30,6 +30,8 @@ LOW_PASS = "low_pass"
 MANY = 4
 #: Share by which errors of a record that was given are larger than before where that is said.
 WORSE = 0.01
+#: Names that are said of many.
+FEW = 3
 #: Measurements that would tell causes apart, of which so many are named.
 NAMED = 4
 
@@ -208,10 +210,17 @@ def untried(result: Closed) -> Iterator[str]:
     for why in (*MISSING.values(), UNTIMED):
         names = [name for name, reason in left.items() if reason.endswith(why)]
         if names:
-            yield f"not tried: {', '.join(names)}: {left[names[0]]}"
+            yield f"not tried: {_few(names)}: {left[names[0]]}"
         left = {name: reason for name, reason in left.items() if name not in names}
     if left:
-        yield f"not tried, why is in result.json: {', '.join(left)}"
+        yield f"not tried, why is in result.json: {_few(list(left))}"
+
+
+def _few(names: Sequence[str]) -> str:
+    """The first of many names, and how many more there are."""
+    if len(names) <= FEW + 1:
+        return ", ".join(names)
+    return f"{', '.join(names[:FEW])} and {len(names) - FEW} more"
 
 
 def judged(gain: str) -> str:

@@ -38,7 +38,7 @@ FEW_ROWS = "a row or a few may carry it: by its size without each of them, chanc
 #: Why an influence in a series is not.
 FEW_OF_MANY = "one in a hundred rows or fewer carry it: look at those that are far out first"
 #: Why what somebody asked for is not: noise, that of the inputs, or what was held out.
-NONE_OF_IT = "no more of it than noise would have (p = {:.2g})"
+NONE_OF_IT = "no more of it than noise like what is left would have (p = {:.2g})"
 FEIGNED = "no more of it than noise of the inputs would have (p = {:.2g})"
 NOT_HELD_OUT = "held-out data do not confirm it"
 #: Why what holds out and has strong evidence is not added.
