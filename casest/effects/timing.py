@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from casest.declaration.effect import RECORDED, effect
-from casest.declaration.physics import SX, der, exp, fabs, fmax, fmin, inf, sqrt
+from casest.declaration.physics import SX, der, exp, fabs, fmax, fmin, sqrt
 from casest.declaration.shapes import each
 from casest.declaration.symbols import param, signal
 
@@ -111,7 +111,6 @@ def creep(
     profile={"turn": "share"},
     memory={"middle": "y"},
     formula="y − k·(y − play(y, w))/w, w = turn·span/2",
-    within={"k": (0.0, inf)},  # below, the reading would run ahead
 )
 def _looped(
     y: SX,

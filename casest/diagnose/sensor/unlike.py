@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casest.data.run import Run
-from casest.declaration.effect import OVER_TIME
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import Candidate
@@ -33,15 +32,13 @@ def another(model: Model, values: Mapping[str, Array], declared: Model) -> tuple
     """Label of an effect that is not what its name says at these values, and why; else empty.
 
     Of axes that have sizes of their own the largest decides. What the `declared` model has already
-    is the user's word. A memory of an implicit model takes back what the sensor did: its sizes have
-    the other sign.
+    is the user's word.
     """
     given = {a.label for a in declared.effects}
     for attached in (a for a in model.effects if a.label not in given):
         for name, (least, most) in attached.effect.within:
             own = [v for n, v in values.items() if _is_of(n, attached.label, name)]
-            back = -1.0 if model.implicit and attached.kind in OVER_TIME else 1.0
-            size = max((float(np.max(back * v)) for v in own), default=most)
+            size = max((float(np.max(v)) for v in own), default=most)
             if not least <= size <= most:
                 beyond = f"above {most:g}" if size > most else f"below {least:g}"
                 why = f"{attached.label} would have {name} = {size:.3g}, {beyond}"
