@@ -123,7 +123,7 @@ def alike(fits: Sequence[Linear]) -> list[Linear]:
     """Fits that are compared: where noise of the inputs counts in one it counts in all.
 
     And to the same rows, without those that one of them has nothing to say of: a lag leaves some
-    whose cause nobody recorded.
+    whose cause nobody recorded. Fits to other rows keep theirs.
     """
     counts = any(fit.counts for fit in fits)
     fits = [fit if fit.counts == counts else replace(fit, counts=counts) for fit in fits]
