@@ -39,7 +39,7 @@ from casest_problems.bias_gravity import bias_gravity  # noqa: E402
 
 KEPT, TABLE = ROOT / "out" / "flight_loop.jsonl", ROOT / "studies" / "flight_loop.md"
 #: Flights of each kind, in turns of so many of all kinds; the first seed.
-COUNT, TURN, FIRST = 200, 5, 400_000
+COUNT, TURN, FIRST = 200, 5, 420_000
 
 #: World -> its sensors at full size, the label that should be found, the size in words.
 WORLDS: dict[str, tuple[Sensors, str, str]] = {

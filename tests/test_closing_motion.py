@@ -25,7 +25,7 @@ from casest.diagnose.motion.whiteness import whiteness
 from casest.diagnose.protocol import ranked
 from casest.dynamics import Motion, constraint, dynamics, measured, state
 from casest.dynamics.filter import filtered
-from casest.dynamics.likelihood import first_guess, likelihood, matched, prepared
+from casest.dynamics.likelihood import applied, first_guess, likelihood, matched, prepared
 from casest.effects.moving import Body, Colour, extended
 from casest.results.motion import motion_result, rms_settled, sentence
 from casest_problems.bias_gravity import bias_gravity, bias_gravity_position
@@ -344,6 +344,36 @@ def test_innovations_of_one_fit_in_the_deviations_of_another():
     np.testing.assert_allclose(there.residual, expected, rtol=1e-8, atol=1e-10)
     assert np.std(subject.linear(other).residual) == pytest.approx(1, rel=0.1)
     assert np.std(there.residual) > 1.1 * np.std(subject.linear(fit).residual)
+
+
+def test_without_what_a_refit_adds_means_through_the_filter_of_the_refit():
+    """Against that filter itself, run without the lever arm; the declared model's own noise, which
+    allows for it, leaves quite other innovations in every row."""
+    run = flight(Sensors(lever=(0.3, -0.1, 0.2)), seed=5, seconds=16)
+    subject = Innovations(with_columns(bias_gravity, run), tuple(candidates(bias_gravity, run)))
+    declared = fitted(bias_gravity, subject.run, filtered(bias_gravity, run).smoothed)
+    (arm,) = [t for t in subject.trials(declared) if t.what.label == "lever_arm of v"]
+    more = subject.refit(declared, [arm])
+    less, whole = subject.compared(declared, more)
+    found = filtered(applied(bias_gravity, more.intensities), subject.run)
+    expected = [
+        solve_triangular(np.linalg.cholesky(S), nu, lower=True)
+        for S, nu in zip(found.S, found.innovations, strict=True)
+    ]
+    effect = np.std(whole.residual - less.residual)
+    assert np.std(less.residual - expected) < 0.05 * effect  # to first order
+    assert np.std(subject.linear(declared).residual - expected) > 0.2 * effect
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [400_100, 400_101])
+def test_two_causes_at_once_are_both_named(seed):
+    """Of the second the likelihood rises by less noise, hardly by smaller innovations."""
+    rng = np.random.default_rng(seed)
+    motion, t = flights.somewhere(rng), np.arange(0, 60, 1 / 50)
+    two = Sensors(gyro_bias=(0.002, -0.001, 0.0015), lever=(0.1, -0.05, 0.07))
+    closing = close_motion(bias_gravity, flights.record(motion, t, rng, two, flights.SIGMA))
+    assert sorted(names(closing)) == ["bias of omega", "lever_arm of v"]
 
 
 def test_a_true_input_is_found_from_its_reading_however_large_the_effect_is():

@@ -65,6 +65,18 @@ class Innovations(Subject[Fit]):
         residual = np.einsum("nij,nj->ni", turn, linear.residual)
         return replace(linear, residual=residual, slopes=turn @ linear.slopes)
 
+    def compared(self, less: Fit, fit: Fit) -> tuple[Linear, Linear]:
+        """Both through the filter of the refit, to first order: one that allows for more noise
+        follows the readings, and leaves other innovations in every row."""
+        there, linear = {c.label for c, _ in less.added}, self.linear(fit)
+        assert fit.answers is not None
+        pairs = list(zip(fit.added, fit.answers.columns, strict=True))
+        more = [(v, where) for (c, v), where in pairs if c.label not in there]
+        part = sum(linear.slopes[:, :, where] @ v for v, where in more)
+        gone = np.concatenate([np.arange(w.start, w.stop) for _, w in more])
+        others = np.delete(linear.slopes, gone, axis=2)
+        return linear.without(others, -np.asarray(part)), linear
+
     def trials(self, fit: Fit) -> list[Trial]:
         """Every effect that is not there, in what the innovations answer to it."""
         there = {c.label for c, _ in fit.added}

@@ -131,7 +131,7 @@ def _beside_the_others(
 
     `base` is the fit without it.
     """
-    linear, whole = subject.linear(base), subject.linear(state.fit)
+    linear, whole = subject.linear(base), subject.linear_in(base, state.fit)
     score, chance, searched = _alone(subject, state, kept, base)
     why = LATER
     strong = score > LEVELS.strong if linear.series else chance < LEVELS.chance

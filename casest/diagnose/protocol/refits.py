@@ -64,7 +64,7 @@ def refitted(
             fits.append((evidence, better))
     refits = [fit for _, fit in fits]
     gains = subject.rises(state.fit, refits) if fits else []
-    even = _where_noise_is_louder(subject, ranking, refits, gains)
+    even = _where_noise_is_louder(subject, state.fit, ranking, refits, gains)
     slow = (refits and subject.rises_beside_a_wander(state.fit, refits)) or gains
     found: list[Refit[F]] = []
     asked = max(sum(subject.asked(e.trials[0].what) for e, _ in fits), 1)
@@ -86,7 +86,7 @@ def refitted(
         kept = with_chance(kept, ranking.likelihood, ranking.families)
         least = _gaining(evidence, min(noisier))
         enough = beyond_courses(ranking, kept) and _strong(ranking, least)
-        few = _by_few_rows(subject, ranking, kept, better) if enough else ""
+        few = _by_few_rows(subject, state.fit, ranking, kept, better) if enough else ""
         if enough and not few:
             found.append(Refit(state.fit, better, kept))
         elif few:
@@ -116,16 +116,16 @@ def _refused(evidence: Evidence, before: Linear, after: Linear) -> str:
     return NOT_HELD_OUT if falls_of_refit(before, after)["pieces"].ratio >= 1 else ""
 
 
-def _by_few_rows(subject: Subject[F], ranking: Ranking, evidence: Evidence, fit: F) -> str:
+def _by_few_rows(subject: Subject[F], less: F, ranking: Ranking, evidence: Evidence, fit: F) -> str:
     """Why it is none where it hangs on a few rows; empty where it is seen whatever the sizes of
     their errors are, what is there in every row of a series in many of them."""
-    after = subject.linear(fit)
-    if after.residual.shape != ranking.linear.residual.shape:
+    before, after = subject.compared(less, fit)
+    if after.residual.shape != before.residual.shape:
         return ""
     influence = all(subject.everywhere(t.what) for t in evidence.trials)
-    if ranking.linear.series and influence and carried_by_few(ranking.linear, after):
+    if before.series and influence and carried_by_few(before, after):
         return FEW_OF_MANY
-    chance = chance_by_row(ranking.linear, after)
+    chance = chance_by_row(before, after)
     chance = shared_chance(chance, evidence, ranking.families)
     return "" if chance < LEVELS.chance else FEW_ROWS.format(chance)
 
@@ -153,20 +153,21 @@ def _gaining(evidence: Evidence, gain: float) -> Evidence:
 
 
 def _where_noise_is_louder(
-    subject: Subject[F], ranking: Ranking, fits: Sequence[F], gains: Sequence[float]
+    subject: Subject[F], less: F, ranking: Ranking, fits: Sequence[F], gains: Sequence[float]
 ) -> list[float]:
     """The gains of refits where readings in bursts of noise count as less; as they are without.
 
     In a burst of a few readings the largest are on one side by chance, and any event is seen.
     """
-    before, after = ranking.linear, [subject.linear(fit) for fit in fits]
+    before, after = ranking.linear, [subject.linear_in(less, fit) for fit in fits]
     same = [x.residual.shape == before.residual.shape for x in after]
     if not before.series or not after or not all(same):
         return list(gains)
     size = louder(before.residual, before.spans)
     if np.any(size > 1):
         gains = rises(before.evened(size), [x.evened(size) for x in after])
-    most = [most_there(before.residual, x.residual) for x in after]
+    pairs = [subject.compared(less, fit) for fit in fits]
+    most = [most_there(one.residual, other.residual) for one, other in pairs]
     return [min(pair) for pair in zip(gains, most, strict=True)]
 
 
@@ -389,7 +390,7 @@ def shown(
         halves = all(f.ratio < LEVELS.most for f in seen.values())
         if not (clear or halves):
             continue
-        if few := _by_few_rows(subject, ranking, kept, better):
+        if few := _by_few_rows(subject, state.fit, ranking, kept, better):
             state = state.failing(evidence, few)
         else:
             (found if clear else halving).append(Refit(state.fit, better, kept, seen))

@@ -25,6 +25,10 @@ class Subject(Protocol[F]):
         """Another fit as a linear problem, its residuals in the units of this one's."""
         return self.linear(other)
 
+    def compared(self, less: F, fit: F) -> tuple[Linear, Linear]:
+        """A fit without what another has more, and that one, to be compared row by row."""
+        return self.linear(less), self.linear(fit)
+
     def trials(self, fit: F) -> Sequence[Trial]:
         """All that could be missing, in its columns; of what has a grid, one for each value."""
         ...
