@@ -110,6 +110,7 @@ def following(
     *,
     trusted: bool = True,
     doubtful: bool = False,
+    likely: str = "",
     applies: bool = True,
     moving: bool = False,
     file: str | Path = "",
@@ -118,7 +119,7 @@ def following(
     """What to type after `command`, a line of words and the command each; empty where unknown.
 
     output: folder of its results; trusted: whether there is an estimate to go on with; doubtful:
-    whether its residual speaks against the model; applies: whether the model says what readings
+    whether its residual speaks against the model; likely: a cause that may be there; applies: whether the model says what readings
     correct to, or that an estimator in motion lacks nothing; moving: whether it is one; file: what
     simulate, apply or export has written; fitted: the command that made the result.
     """
@@ -128,7 +129,7 @@ def following(
     if typed.name == "close" and moving:
         steps = _after_motion(typed, output, trusted and applies)
     elif typed.name in ("calibrate", "close"):
-        steps = _after_fit(typed, output, trusted, applies and not doubtful)
+        steps = _after_fit(typed, output, trusted, applies and not doubtful, likely)
     elif typed.name == "simulate":
         steps = (_after_flight if moving else _after_simulate)(typed, file)
     elif typed.name == "export":
@@ -149,7 +150,9 @@ def applying(typed: Typed, output: str | Path) -> Typed:
 _Steps = Iterator[tuple[str, str]]
 
 
-def _after_fit(typed: Typed, output: str | Path | None, trusted: bool, applies: bool) -> _Steps:
+def _after_fit(
+    typed: Typed, output: str | Path | None, trusted: bool, applies: bool, likely: str
+) -> _Steps:
     flags = (*_MODEL, *_READING, *_FIT)
     if not trusted:
         yield "what can these data see?", typed.keeping("observe", (*_MODEL, *_READING)).lines()
@@ -158,6 +161,11 @@ def _after_fit(typed: Typed, output: str | Path | None, trusted: bool, applies: 
         into = Path(output) / "closed" if output else "out"
         own = [flag for flag in flags if flag != "--noise-law"]  # that is calibrate's
         yield "does the model lack an effect?", typed.keeping("close", own).into(into).lines()
+    if likely:
+        named = typed.keeping("close", flags)
+        named = replace(named, options=(*named.options, ("--effects", likely)))
+        into = Path(output) / "named" if output else "out"
+        yield f"if you know that it is {likely}", named.into(into).lines()
     if output is None:
         yield "keep the result", typed.keeping(typed.name, flags).into("out").lines()
     elif applies:

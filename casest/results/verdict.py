@@ -259,10 +259,17 @@ def undecided(left: Unexplained, parameters: Mapping[str, Parameter]) -> Iterato
         if shifts:
             yield f"{label} would move the parameters: {_moved_by(shifts, parameters)}"
     yield from (f"to tell {words}" for words in left.would_separate[:NAMED])
-    shipped = {e.name for e in CATALOGUE}
-    names = [label.partition("(")[0] for label in left.would_move]
-    if name := next((n for n in names if n in shipped), ""):
+    if name := to_be_asked(left):
         yield f"who knows which of them is there says so, as --effects {name}"
+
+
+def to_be_asked(left: Unexplained) -> str:
+    """A shipped effect, the likeliest, of those that none was added of; empty where there is none
+    that explains what counts."""
+    shipped = {e.name for e in CATALOGUE}
+    enough = (left.share or 0.0) >= LEVELS.share
+    names = [label.partition("(")[0] for label in (left.one_of if enough else left.would_move)]
+    return next((name for name in names if name in shipped), "")
 
 
 def _moved_by(shifts: Shifts, parameters: Mapping[str, Parameter]) -> str:

@@ -23,6 +23,7 @@ from casest.results.verdict import (
     refusals,
     sentence,
     sided,
+    to_be_asked,
     undecided,
     untried,
 )
@@ -49,8 +50,15 @@ def closing_text(result: Closed, output: Path | None) -> str:
     ]
     if output is not None:
         blocks.append(f"Written: {output}/report.html, result.json, residuals.csv")
-    applies = result.corrected is not None
-    blocks.append(following(result.reproduce.command, output, applies=applies))
+    blocks.append(
+        following(
+            result.reproduce.command,
+            output,
+            doubtful=result.verdict == "unexplained",
+            likely=to_be_asked(result.unexplained),
+            applies=result.corrected is not None,
+        )
+    )
     return "\n\n".join(b for b in blocks if b)
 
 
