@@ -187,6 +187,29 @@ def test_a_long_command_continues_as_a_shell_reads_it():
     assert typed_words("pytest -q tests") is None
 
 
+def test_after_a_misfit_the_next_command_asks_for_a_cause_and_corrects_nothing(tmp_path, capsys):
+    """A gain that changes at 6 and noise: several bends explain a part of it, none all."""
+    x = np.linspace(0, 10, 60)
+    noise = 0.02 * np.random.default_rng(5).standard_normal(60)
+    y = 2 * x + 1 + 0.5 * np.maximum(x - 6, 0) + noise
+    np.savetxt(tmp_path / "t.csv", np.c_[x, y], "%.6f", ",", header="x,y", comments="")
+    words = ["close", "linear", str(tmp_path / "t.csv"), "--columns", "reference=x"]
+    words += ["--columns", "reading=y", "-o", str(tmp_path / "out")]
+    assert run(words) == 0
+    printed = capsys.readouterr().out
+    assert "unexplained" in printed
+    assert "Next: correct readings" not in printed
+    (asked,) = nexts(printed)
+    assert asked.startswith("casest close linear ")
+    again = shlex.split(asked)[1:]
+    name = again[again.index("--effects") + 1]
+    assert f"says so, as --effects {name}" in printed
+    assert run(again) == 0
+    printed = capsys.readouterr().out
+    assert f"{name} was not added: no more of it than noise" in " ".join(printed.split())
+    assert "says so, as" not in printed  # it was
+
+
 def test_the_list_names_every_shipped_problem_and_effect(said):
     from casest.effects import CATALOGUE
     from casest.results.find import MOVING, SHIPPED

@@ -119,9 +119,10 @@ def following(
     """What to type after `command`, a line of words and the command each; empty where unknown.
 
     output: folder of its results; trusted: whether there is an estimate to go on with; doubtful:
-    whether its residual speaks against the model; likely: a cause that may be there; applies: whether the model says what readings
-    correct to, or that an estimator in motion lacks nothing; moving: whether it is one; file: what
-    simulate, apply or export has written; fitted: the command that made the result.
+    whether its residual speaks against the model; likely: a cause that may be there; applies:
+    whether the model says what readings correct to, or that an estimator in motion lacks nothing;
+    moving: whether it is one; file: what simulate, apply or export has written; fitted: the command
+    that made the result.
     """
     typed = typed_words(command)
     if typed is None or not typed.arguments:
@@ -129,7 +130,9 @@ def following(
     if typed.name == "close" and moving:
         steps = _after_motion(typed, output, trusted and applies)
     elif typed.name in ("calibrate", "close"):
-        steps = _after_fit(typed, output, trusted, applies and not doubtful, likely)
+        unexplained = doubtful and typed.name == "close"
+        applies = applies and not doubtful
+        steps = _after_fit(typed, output, trusted, applies, unexplained, likely)
     elif typed.name == "simulate":
         steps = (_after_flight if moving else _after_simulate)(typed, file)
     elif typed.name == "export":
@@ -151,7 +154,12 @@ _Steps = Iterator[tuple[str, str]]
 
 
 def _after_fit(
-    typed: Typed, output: str | Path | None, trusted: bool, applies: bool, likely: str
+    typed: Typed,
+    output: str | Path | None,
+    trusted: bool,
+    applies: bool,
+    unexplained: bool,
+    likely: str,
 ) -> _Steps:
     flags = (*_MODEL, *_READING, *_FIT)
     if not trusted:
@@ -161,11 +169,11 @@ def _after_fit(
         into = Path(output) / "closed" if output else "out"
         own = [flag for flag in flags if flag != "--noise-law"]  # that is calibrate's
         yield "does the model lack an effect?", typed.keeping("close", own).into(into).lines()
-    if likely:
+    if unexplained:
+        words = f"if you know that it is {likely}" if likely else "if you know of an effect"
         named = typed.keeping("close", flags)
-        named = replace(named, options=(*named.options, ("--effects", likely)))
-        into = Path(output) / "named" if output else "out"
-        yield f"if you know that it is {likely}", named.into(into).lines()
+        named = replace(named, options=(*named.options, ("--effects", likely or "my_effect.py")))
+        yield words, named.into(Path(output) / "asked" if output else "out").lines()
     if output is None:
         yield "keep the result", typed.keeping(typed.name, flags).into("out").lines()
     elif applies:

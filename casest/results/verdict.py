@@ -253,20 +253,22 @@ def instead(effect: Effect, parameters: Mapping[str, Parameter]) -> Iterator[str
             yield f"were it {label} instead, the parameters would move: {words}"
 
 
-def undecided(left: Unexplained, parameters: Mapping[str, Parameter]) -> Iterator[str]:
+def undecided(
+    left: Unexplained, parameters: Mapping[str, Parameter], command: str = ""
+) -> Iterator[str]:
     """Causes of which none was added: what each would do, what would tell them apart."""
     for label, shifts in left.would_move.items():
         if shifts:
             yield f"{label} would move the parameters: {_moved_by(shifts, parameters)}"
     yield from (f"to tell {words}" for words in left.would_separate[:NAMED])
-    if name := to_be_asked(left):
+    if name := to_be_asked(left, command):
         yield f"who knows which of them is there says so, as --effects {name}"
 
 
-def to_be_asked(left: Unexplained) -> str:
+def to_be_asked(left: Unexplained, command: str) -> str:
     """A shipped effect, the likeliest, of those that none was added of; empty where there is none
-    that explains what counts."""
-    shipped = {e.name for e in CATALOGUE}
+    that explains what counts, or where the `command` asked for some."""
+    shipped = set() if "--effects" in command else {e.name for e in CATALOGUE}
     enough = (left.share or 0.0) >= LEVELS.share
     names = [label.partition("(")[0] for label in (left.one_of if enough else left.would_move)]
     return next((name for name in names if name in shipped), "")

@@ -182,13 +182,14 @@ class Sensor(Subject[Fit]):
         """Why a refit is not what its names say, or is what the model says itself; else empty."""
         spans = [float(np.ptp(run.time)) for run in self.runs if run.time is not None]
         added = [t.what for t in trials]
+        found = [what for what in added if not self.asked(what)]
         why = (
             too_slow(after.values, added, spans)
             or another(after.model, after.values, self.model)[1]
-            or stands_in(before, after, [w for w in added if not self.asked(w)], self.rows)
+            or stands_in(before, after, found, self.rows)
             or driven(before, after, added, self.rows)
             or to_both_sides(before, after, added, self.rows)
-            or smooth(self.linear(before), self.linear(after), added, self.rows.met(before))
+            or smooth(self.linear(before), self.linear(after), found, self.rows.met(before))
         )
         bends = [t for t in trials if bend(t.what)] if self.linear(before).series else []
         if bends and not why:

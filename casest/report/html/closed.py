@@ -145,7 +145,7 @@ def _effects(result: Closed) -> str:
         said = [paragraph("None was needed: no candidate makes held-out data better predicted.")]
     left = result.unexplained
     if result.verdict == "unexplained" and left.fraction is not None:
-        words = undecided(left, result.after.parameters)
+        words = undecided(left, result.after.parameters, result.reproduce.command)
         said += [
             tag("h3", "What is left unexplained"),
             paragraph(f"{percent(left.fraction)} of the held-out variance: {left.where}."),

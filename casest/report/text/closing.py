@@ -55,7 +55,7 @@ def closing_text(result: Closed, output: Path | None) -> str:
             result.reproduce.command,
             output,
             doubtful=result.verdict == "unexplained",
-            likely=to_be_asked(result.unexplained),
+            likely=to_be_asked(result.unexplained, result.reproduce.command),
             applies=result.corrected is not None,
         )
     )
@@ -164,7 +164,10 @@ def _unexplained(result: Closed) -> Iterator[str]:
     if result.verdict == "unexplained" and left.fraction is not None:
         share = percent(left.fraction)
         yield item(f"Unexplained: {share} of the held-out variance, {left.where}")
-        yield from (item(words) for words in undecided(left, result.after.parameters))
+        yield from (
+            item(words)
+            for words in undecided(left, result.after.parameters, result.reproduce.command)
+        )
 
 
 def _detectable(result: Closed) -> Iterator[str]:
