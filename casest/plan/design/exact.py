@@ -1,4 +1,4 @@
-"""Whole measurements: greedy, then exchanged one by one (Fedorov 1972) until none gains."""
+"""Whole measurements, exchanged one by one (Fedorov 1972) until none gains."""
 
 from __future__ import annotations
 
@@ -13,18 +13,6 @@ from casest.plan.design.criteria import Criterion, inverse
 PASSES = 20
 #: Share of Φ below which an exchange gains nothing.
 GAIN = 1e-9
-
-
-def greedy(
-    criterion: Criterion, known: Array, factors: Array, count: int, start: Sequence[int] = ()
-) -> list[int]:
-    """Each time the candidate that brings most, until there are `count`."""
-    chosen, M = list(start), known + sum((_square(factors[i]) for i in start), np.zeros_like(known))
-    while len(chosen) < count:
-        best = int(np.argmin(criterion.after(inverse(M), factors)))
-        chosen.append(best)
-        M = M + _square(factors[best])
-    return chosen
 
 
 def exchanged(

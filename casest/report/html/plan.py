@@ -13,9 +13,6 @@ from casest.report.html.page import escaped, paragraph, points, section, table, 
 from casest.report.html.sphere import sphere
 from casest.results.plan import Plan, headline, plan_words
 
-#: Where the page is.
-SHEET = "plan.html"
-
 
 def plan_page(result: Plan) -> str:
     """What to measure, in order, with a box to tick; the sphere; what it brings; how good it is."""
