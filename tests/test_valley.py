@@ -21,10 +21,12 @@ from casest import (
     param,
     signal,
 )
+from casest.effects import signal_lag
 from casest.estimate.calibrate import _estimate
 from casest.estimate.certificate import Certificate
 from casest.estimate.evidence import Evidence, judged
-from casest.leastsquares.many_points import separable
+from casest.estimate.valley import searchable
+from casest.leastsquares.many_points import normals, separable
 from casest.leastsquares.neighbours import Scatter, scatter
 from casest.leastsquares.problem import Problem
 from casest.solve.aliases import periods
@@ -47,6 +49,23 @@ def sine_run(w=9.0, p=0.5, n=80, noise=0.05, seed=0, even=True, shuffled=False, 
     x = np.linspace(0, 10, n) if even else np.sort(rng.uniform(0, 10, n))
     x = rng.permutation(x) if shuffled else x
     return as_run(x=unit * x, y=np.sin(w * x + p) + noise * rng.standard_normal(n))
+
+
+def test_a_search_looks_at_the_function_that_is_fitted():
+    """Else it finds valleys of another one: of many points at once no lag was followed, and a model
+    with one was searched all the same."""
+    rng = np.random.default_rng(3)
+    t = np.arange(0, 20, 0.05)
+    course = np.cumsum(rng.standard_normal(len(t))) * 0.2
+    late = np.interp(t - 0.3, t, course)
+    run = replace(as_run(x=course, y=np.sin(2 * late + 0.4)), time=t)
+    delayed = sine.with_effect(signal_lag, on="x")
+    for one in (sine, delayed):
+        problem = Problem(one, (run,))
+        x = np.array([2.0, 0.4, 0.3][: problem.unknowns])
+        (many,) = normals(problem, problem.start().references, x[None], np.arange(len(x)))
+        right = many.cost[0] == pytest.approx(problem.cost(replace(problem.start(), x=x)))
+        assert right == searchable(one)
 
 
 # -- the scatter of neighbours ---------------------------------------------------------------------

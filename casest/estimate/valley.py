@@ -228,12 +228,15 @@ def _near(a: Point, b: Point) -> bool:
 
 
 def searchable(model: Model) -> bool:
-    """May there be several valleys, and does nothing but a declared start say which is meant?"""
+    """May there be several valleys, and does nothing but a declared start say which is meant?
+
+    What looks at other samples is not searched: some rows alone, far apart, are another record.
+    """
     return not (
         model.starter is not None
         or model.implicit
         or has_noise_effects(model)
         or linear(model)
-        or any(a.kind == "sequence" for a in model.effects)
+        or any(a.kind in ("sequence", "time") for a in model.effects)
         or model.traced.integrates
     )
