@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from casest.errors import DataError
+from casest import units as casest_units
+from casest.errors import DataError, UnitError
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.str_]
@@ -159,6 +160,14 @@ class Run:
     def recorded(self, name: str) -> Array:
         """Return the values (M, size) of a signal in the samples where it was read."""
         return self.signals[name][self.read.get(name, slice(None))]
+
+    def in_unit(self, name: str, unit: str) -> Array | None:
+        """Readings of a signal in another unit; None where theirs is unknown or of another kind."""
+        try:
+            factor, zero = casest_units.conversion(self.units.get(name) or "", unit)
+        except UnitError:
+            return None
+        return self.signals[name] * factor + zero
 
     def clock(self, name: str) -> Array:
         """Return the times (M,) in s at which a signal was read, of a record that has times."""

@@ -27,7 +27,7 @@ from casest.diagnose.protocol.ranking import ranked
 from casest.diagnose.protocol.refits import AS_MUCH
 from casest.diagnose.sensor import Fit, Sensor
 from casest.diagnose.sensor.courses import courses
-from casest.diagnose.sensor.final import certified, left_in
+from casest.diagnose.sensor.final import certified, chance_of_sizes, left_in
 from casest.diagnose.sensor.foretelling import foretelling, on_the_same_samples
 from casest.diagnose.sensor.outliers import spoilt, without_outliers
 from casest.diagnose.sensor.to_both_sides import of_inputs
@@ -261,7 +261,10 @@ def _found(sensor: Sensor, state: State[Fit], kept: Kept, after: Estimate) -> Fo
         for r in kept.rivals
         if r.what.label not in added
     }
-    return Found(candidate, chance_alone(sensor, state, kept), fall, names, rivals)
+    chance = chance_alone(sensor, state, kept)
+    if sensor.linear(state.fit).coloured:
+        chance = max(chance, chance_of_sizes(candidate.label, after))
+    return Found(candidate, chance, fall, names, rivals)
 
 
 def _fall(fit: Fit, kept: Kept) -> float:

@@ -121,6 +121,18 @@ def _is_nothing(attached: Attached, after: Estimate) -> bool:
     return by_chance[0] > TWO_SIDED > by_chance[1]
 
 
+def chance_of_sizes(label: str, after: Estimate) -> float:
+    """The chance of an effect's sizes by the standard deviations that are printed of them; 0 of
+    one that has none. A likelihood beside slow noise weighs what is quick, they weigh all of it."""
+    attached = next((a for a in after.model.effects if a.label == label), None)
+    own = _places(_sizes(attached), after) if attached is not None else np.zeros(0, int)
+    C = after.covariance[np.ix_(own, own)]
+    if not own.size or not np.isfinite(C).all():
+        return 0.0
+    freedom = float(np.array(after.effective_freedom)[own].min())
+    return _by_chance(after.point.x[own], C, freedom)
+
+
 def _sizes(attached: Attached) -> set[str]:
     """Parameters of an effect that are none where it is none."""
     searched = dict(attached.effect.profile)
