@@ -152,48 +152,46 @@ def kind_of(name: str) -> tuple[str, float]:
 
 # -- table -------------------------------------------------------------------------------------
 
-PAGE = """# The loop in motion on simulated flights
+HEAD = """# The loop in motion on simulated flights
 
-Made by `python studies/flight_loop.py` (`make study-flights`), {count} flights and {minutes:.0f}
-minutes of processor time. Flights of 60 s by closed forms (`tests/flights.py`), Batista's sensor
-noises; `casest close bias-gravity` as it is shipped, with the published intensities as its start.
-Seeds from {first} on were looked at by no rule. Flights are kept as they were closed: a table that
-grew over some time has rows of several states of the loop. {aim}
+Made by `python studies/flight_loop.py` (`make study-flights`). Flights of 60 s by closed forms
+(`tests/flights.py`), Batista's sensor noises; `casest close bias-gravity` as it is shipped, with
+the published intensities as its start. Each section says which flights it is of: one of which none
+are at hand stays as it was. No rule looked at their seeds.
+"""
 
-## Nothing missing
-
+#: Sections: titles, and what stands there.
+SECTIONS = {
+    "Nothing missing": """
 {nulls} flights, half at 25 Hz, half at 50 Hz, with noises of one to three times Batista's, which
 the loop is not told: an effect was reported in {false} ({share:.1%}, at most {upper:.1%} with 95 %
 confidence); called unexplained: {unexplained}. Median processor time {seconds:.1f} s.
 
 {kinds}
-
-## One effect planted
-
+""",
+    "One effect planted": """
 At 50 Hz. Named: first, or among at most two that it cannot be told apart from. Errors are one-step
 innovations of the velocity (m/s, rms, held-out time; noise of 0.01 m/s stays in any case), and what
 a flight's log-likelihood gained. `error` is the median distance of the found number from the
 planted one, in its own standard deviations.
 
 {rows}
-
-## Effects of the sensors' catalogue
-
+""",
+    "Effects of the sensors' catalogue": """
 As above. A constant wind changes nothing of gravity and bias that a speed through air shows, and
 nothing should be found.
 
 {others}
-
-## A noisy gyro
-
+""",
+    "A noisy gyro": """
 White noise of 0.5 °/s in one reading, ten times Batista's, which the loop is not told either.
 
 {noisy}
-
-## Two at once
-
+""",
+    "Two at once": """
 {pair}
-"""
+""",
+}
 
 #: Columns of the tables.
 KIND_HEAD = ("other noise", "flights", "with an effect", "unexplained")
@@ -216,7 +214,39 @@ def read() -> dict[tuple[str, int], dict[str, Any]]:
     return {(k["name"], k["seed"]): k for k in kept}
 
 
-def table(kept: dict[tuple[str, int], dict[str, Any]]) -> str:
+def page(kept: dict[tuple[str, int], dict[str, Any]], before: str) -> str:
+    """The page with the sections of which there are flights; the others as they were `before`."""
+    parts = {part.partition("\n")[0]: part for part in before.split("\n## ")[1:]}
+    sections = [HEAD]
+    for title, body in SECTIONS.items():
+        own = {key: k for key, k in kept.items() if section_of(key[0]) == title}
+        if own:
+            minutes = sum(k["seconds"] for k in own.values()) / 60
+            first = min(k["seed"] for k in own.values())
+            made = (
+                f"{len(own)} flights, seeds from {first} on; {minutes:.0f} minutes of a processor."
+            )
+            parts[title] = f"{title}\n\n{made}\n{body.format(**_filled(own))}"
+        if title in parts:
+            sections.append(parts[title].strip("\n") + "\n")
+    return "\n## ".join(sections)
+
+
+def section_of(name: str) -> str:
+    """In which section a world stands."""
+    kind, _ = kind_of(name)
+    if name == "gyro bias and lever arm":
+        return "Two at once"
+    if name.endswith("noisy gyro"):
+        return "A noisy gyro"
+    if name.startswith("null"):
+        return "Nothing missing"
+    return "One effect planted" if kind in WORLDS else "Effects of the sensors' catalogue"
+
+
+def _filled(kept: dict[tuple[str, int], dict[str, Any]]) -> dict[str, Any]:
+    """What stands in the places of a section."""
+
     def of(name: str) -> list[dict[str, Any]]:
         return [k for k in kept.values() if k["name"] == name]
 
@@ -224,32 +254,27 @@ def table(kept: dict[tuple[str, int], dict[str, Any]]) -> str:
     false = sum(bool(k["found"]) for k in nulls)
     both = of("gyro bias and lever arm")
     named = sum({"bias of omega", "lever_arm of v"} == set(k["found"]) for k in both)
-    aim = f"Meant are {COUNT} of each kind: what there is is said in each row."
-    return PAGE.format(
-        count=len(kept),
-        minutes=sum(k["seconds"] for k in kept.values()) / 60,
-        first=FIRST,
-        aim="" if len(kept) == sum(1 for _ in tasks()) else aim,
-        nulls=len(nulls),
-        false=false,
-        share=false / max(len(nulls), 1),
-        upper=float(beta.ppf(0.95, false + 1, max(len(nulls) - false, 1))),
-        unexplained=_unexplained(nulls),
-        seconds=float(np.median([k["seconds"] for k in nulls])) if nulls else np.nan,
-        kinds=_table(KIND_HEAD, (_kind(name, of(name)) for name in KINDS)),
-        rows=_table(ROW_HEAD, (_row(n, s, of(f"{n} x{s:g}")) for n in WORLDS for s in SHARES)),
-        others=_table(
+    return {
+        "nulls": len(nulls),
+        "false": false,
+        "share": false / max(len(nulls), 1),
+        "upper": float(beta.ppf(0.95, false + 1, max(len(nulls) - false, 1))),
+        "unexplained": _unexplained(nulls),
+        "seconds": float(np.median([k["seconds"] for k in nulls])) if nulls else np.nan,
+        "kinds": _table(KIND_HEAD, (_kind(name, of(name)) for name in KINDS)),
+        "rows": _table(ROW_HEAD, (_row(n, s, of(f"{n} x{s:g}")) for n in WORLDS for s in SHARES)),
+        "others": _table(
             OTHER_HEAD,
             (_other(n, s, of(f"{n} x{s:g}")) for n in flights.CHANGES for s in SHARES),
         ),
-        noisy=_table(
+        "noisy": _table(
             OTHER_HEAD,
             [_other("", 1.0, of("noisy gyro"))]
             + [_other(n, 1.0, of(f"{n}, noisy gyro")) for n in BESIDE],
         ),
-        pair=f"Gyro bias and lever arm of the table's sizes: exactly both named in {named} of "
+        "pair": f"Gyro bias and lever arm of the table's sizes: exactly both named in {named} of "
         f"{len(both)} flights.",
-    )
+    }
 
 
 def _unexplained(kept: list[dict[str, Any]]) -> int:
@@ -338,7 +363,8 @@ def main() -> None:
             file.write(json.dumps(made) + "\n")
         print(f"{k + 1}/{len(left)} {name}, {seed}: {made['verdict']} {made['found']}", flush=True)
     else:
-        TABLE.write_text(table(read()), encoding="utf-8")
+        before = TABLE.read_text(encoding="utf-8") if TABLE.exists() else ""
+        TABLE.write_text(page(read(), before), encoding="utf-8")
 
 
 if __name__ == "__main__":
