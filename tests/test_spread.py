@@ -26,6 +26,16 @@ def line(x=signal(), y=signal(), *, slope=param(), level=param()):
     return Residual(measured=y, predicted=level + slope * x)
 
 
+@model
+def three(v=signal(3), *, level=param(3)):
+    return Residual(measured=v, predicted=level)
+
+
+@model
+def one(w=signal(), *, level=param()):
+    return Residual(measured=w, predicted=level)
+
+
 def fits(count, noise, n, seed=0):
     """Errors (count, 2) of lines in time, their printed std, and the estimates themselves."""
     rng = np.random.default_rng(seed)
@@ -214,6 +224,24 @@ def test_a_record_of_few_memories_of_its_noise_says_so(n, memory, spikes):
     declared = line.with_effect(OUTLIERS) if spikes else line
     inside, _ = held(declared, remembered(memory, 0.6, spikes), n)
     assert np.all(inside >= 0.88)  # 1 in 100 below that, of 60
+
+
+def test_axes_with_noise_of_their_own_have_the_std_that_each_has_alone():
+    """In a long record the likeliest colours of an axis leave others no chance at all, and of an
+    unknown of another axis it says nothing: its std was printed as 0."""
+    rng, n = np.random.default_rng(4), 6000
+    colour = signal_processing.lfilter([1], [1, -0.96], rng.standard_normal((40, n, 3)), axis=1)
+    z = []
+    for v in 0.01 * colour * [1.0, 3.0, 1.0] + [5.0, -1.0, 0.2]:
+        time = np.arange(n) * 0.02
+        run = Run.raw("r", {"v": v}, units={}, time=time)
+        found = attempt(three, [run], solver="trust-region")
+        z.append((found.values["level"] - [5.0, -1.0, 0.2]) / found.std["level"])
+    for k in range(3):
+        run = Run.raw("r", {"w": v[:, k : k + 1]}, units={}, time=time)
+        alone = attempt(one, [run], solver="trust-region")
+        assert found.std["level"][k] == pytest.approx(alone.std["level"], rel=0.1)
+    assert np.sqrt(np.mean(np.square(z))) == pytest.approx(1, abs=0.2)  # 120 of them: ± 0.065
 
 
 @pytest.mark.parametrize(("rows", "time"), [(90, None), (90, 0.1), (300, None)])

@@ -52,8 +52,8 @@ def remembering(parts: Sequence[Part], bread: Array) -> tuple[Array, Array]:
     for k in sorted({part.axis for part in parts}):
         axis = _axis([part for part in parts if part.axis == k])
         each = axis.power @ _pulls(axis, bread)
-        with np.errstate(divide="ignore"):
-            own = np.exp(axis.weight @ np.log(each))
+        own, there = np.zeros(n), (each > 0).all(axis=0)  # nothing of what other axes alone tell
+        own[there] = np.exp(axis.weight @ np.log(each[:, there]))
         mean = axis.weight @ axis.power
         for part, band in zip(axis.parts, axis.bands, strict=True):
             middle[np.ix_(part.x, part.x)] += (part.jacobian.T * mean[band]) @ part.jacobian
