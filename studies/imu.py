@@ -86,7 +86,7 @@ def simulated(world: str, seed: int) -> dict[str, Any]:
     truth, (below, above) = {**imu.truth, "dip": np.array(DIP)}, found.interval_reach
     parts = {}
     for n, value in found.values.items():
-        free = found.std[n] > 0
+        free = (found.std[n] > 0) | (value != truth[n])
         away = (value - truth[n])[free]
         parts[n] = {
             "z": (away / found.std[n][free]).tolist(),
