@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -68,14 +68,17 @@ class Innovations(Subject[Fit]):
     def compared(self, less: Fit, fit: Fit) -> tuple[Linear, Linear]:
         """Both through the filter of the refit, to first order: one that allows for more noise
         follows the readings, and leaves other innovations in every row."""
-        there, linear = {c.label for c, _ in less.added}, self.linear(fit)
+        there = {c.label for c, _ in less.added}
+        return self._apart(fit, {c.label for c, _ in fit.added} - there)[0], self.linear(fit)
+
+    def _apart(self, fit: Fit, labels: Set[str]) -> tuple[Linear, Array]:
+        """The innovations as if some effects were not there, to first order, and their columns."""
         assert fit.answers is not None
-        pairs = list(zip(fit.added, fit.answers.columns, strict=True))
-        more = [(v, where) for (c, v), where in pairs if c.label not in there]
-        part = sum(linear.slopes[:, :, where] @ v for v, where in more)
-        gone = np.concatenate([np.arange(w.start, w.stop) for _, w in more])
-        others = np.delete(linear.slopes, gone, axis=2)
-        return linear.without(others, -np.asarray(part)), linear
+        linear, pairs = self.linear(fit), zip(fit.added, fit.answers.columns, strict=True)
+        gone = [(v, np.arange(w.start, w.stop)) for (c, v), w in pairs if c.label in labels]
+        value, where = (np.concatenate(each) for each in zip(*gone, strict=True))
+        columns, others = linear.slopes[:, :, where], np.delete(linear.slopes, where, axis=2)
+        return linear.without(others, -(columns @ value)), columns
 
     def trials(self, fit: Fit) -> list[Trial]:
         """Every effect that is not there, in what the innovations answer to it."""
@@ -130,13 +133,8 @@ class Innovations(Subject[Fit]):
         """The innovations as if an effect were not there, and the effect as a trial of them."""
         if fit.answers is None:
             return None
-        linear, pairs = self.linear(fit), zip(fit.added, fit.answers.columns, strict=True)
-        ((value, where),) = [(v, w) for (c, v), w in pairs if c.label == kept.what.label]
-        columns = linear.slopes[:, :, where]
-        others = np.delete(linear.slopes, np.arange(where.start, where.stop), axis=2)
-        return linear.without(others, -(columns @ value)), Trial(
-            kept.what, kept.what.label, columns
-        )
+        linear, columns = self._apart(fit, {kept.what.label})
+        return linear, Trial(kept.what, kept.what.label, columns)
 
 
 def _taken_away(fit: Fit) -> str:
