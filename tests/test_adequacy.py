@@ -134,9 +134,31 @@ def test_a_wave_in_a_column_is_a_misfit():
 
 
 def test_a_wave_in_a_column_names_the_column():
-    """It follows the column exactly, and time only nearly."""
+    """Two of its swings: another slow course might go with it for as long."""
     found = judged(record(white, 0, n=1200, positions=0, misfit=wave))
-    assert "temp" in found.where
+    assert "of unknown cause: temp goes with it, as slow courses may by chance" in found.where
+
+
+def smooth(rng, n, over):
+    """A smooth random course (n,) of variance 1."""
+    window = np.exp(-0.5 * (np.arange(-4 * over, 4 * over + 1) / over) ** 2)
+    course = np.convolve(rng.standard_normal(n + 8 * over), window, "same")[4 * over : 4 * over + n]
+    return (course - course.mean()) / course.std()
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("answers", [True, False])
+def test_a_slow_residual_follows_a_column_where_it_answers_to_its_values(seed, answers):
+    """Beside a slow course of its own. Before, every slow residual followed every slow column."""
+    rng, n = np.random.default_rng([2, seed]), 1500
+    run = record(white, seed, n=n, positions=0)
+    warm = 20 + 5 * smooth(rng, n, 12 if answers else 120)
+    misfit = smooth(rng, n, 60) + (2 * np.sin(warm) if answers else 0.0)
+    y = run.signals["y"] + misfit[:, None]
+    run = replace(run, signals={**run.signals, "y": y}, columns={"temp": warm})
+    found = judged(run)
+    assert found.significant
+    assert ("of it follows temp" in found.where) is answers
 
 
 def test_the_share_of_a_wave_is_the_one_that_it_has():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -20,7 +20,7 @@ from casest.diagnose.misfit.few_rows import few_rows
 from casest.diagnose.misfit.noisy_inputs import beside_noise_of_inputs
 from casest.diagnose.misfit.pure_error import pure_error
 from casest.diagnose.misfit.reference import along_reference
-from casest.diagnose.misfit.structure import structures
+from casest.diagnose.misfit.structure import Structure, more_than_courses_do, structures
 from casest.diagnose.misfit.variables import variables
 from casest.diagnose.noise.noise_model import step_of
 from casest.diagnose.noise.slow_course import MEMORY, slow_course
@@ -81,9 +81,14 @@ def findings(
     found = _before(problem, point) + _stated(problem, point)
     found += in_few_rows(problem, point) + _far_out(problem, sigma)
     found += _repeats(problem, point, clipped, wanders=wanders)
-    slow = [] if wanders else _slow(problem, point, clipped, sigma)
-    follows = _follows(problem, point, clipped, in_time=not (slow or wanders))
-    found += follows + slow
+    course = None if wanders else _slow(problem, point, clipped, sigma)
+    slow, over = course or (None, 0)
+    follows, by_chance = _follows(problem, point, clipped, over, in_time=not (slow or wanders))
+    found += follows
+    if slow and by_chance and by_chance[0].share > LEVELS.most * slow.share:
+        why = f": {by_chance[0].name} goes with it, as slow courses may by chance"
+        slow = replace(slow, where=slow.where + why)
+    found += [slow] if slow else []
     line = strongest_line(problem.runs, clipped)
     if line is not None and line.p_value < LEVELS.misfit:
         where = f"a line at {line.frequency:.4g} {line.unit}"
@@ -187,8 +192,10 @@ def _stated(problem: Problem, point: Point) -> list[Finding]:
     return [Finding(where, found.larger, sigma=scale)]
 
 
-def _slow(problem: Problem, point: Point, clipped: Sequence[Array], sigma: float) -> list[Finding]:
-    """A slow course of unknown cause, of an axis or along the reference.
+def _slow(
+    problem: Problem, point: Point, clipped: Sequence[Array], sigma: float
+) -> tuple[Finding, int] | None:
+    """A slow course of unknown cause, of an axis or along the reference, and over how many samples.
 
     What rounding to a step leaves of a slow input is known.
     """
@@ -197,9 +204,9 @@ def _slow(problem: Problem, point: Point, clipped: Sequence[Array], sigma: float
         clipped = [np.hstack(both) for both in zip(clipped, along, strict=True)]
     found = slow_course(problem.runs, clipped)
     if found is None or found.p_value >= LEVELS.misfit or found.share < LEVELS.share:
-        return []
+        return None
     if sigma < LEVELS.rounded * step_of(problem.runs, problem.model.traced.measured):
-        return []
+        return None
     it = (
         "what of it goes with the size of the input"
         if found.axis == len(problem.model.axes)
@@ -209,7 +216,7 @@ def _slow(problem: Problem, point: Point, clipped: Sequence[Array], sigma: float
         f"{100 * found.share:.0f} % of {it} is a slow course over about {found.samples} samples"
         f"{_when(problem, clipped, found.samples)}, of unknown cause"
     )
-    return [Finding(where, found.p_value, found.share, slow=True)]
+    return Finding(where, found.p_value, found.share, slow=True), found.samples
 
 
 def _when(problem: Problem, clipped: Sequence[Array], samples: int) -> str:
@@ -244,12 +251,16 @@ def _follows(
     problem: Problem,
     point: Point,
     clipped: Sequence[Array],
+    over: int,
     *,
     in_time: bool,
-) -> list[Finding]:
-    """What it follows: a column, a quantity; the time only where no slow course says so."""
+) -> tuple[list[Finding], list[Structure]]:
+    """What it follows: a column, a quantity; the time only where no slow course says so.
+
+    Apart, the most first, what a slow course (`over` so many samples, else 0) may follow by chance.
+    """
     if any(run.spread for run in problem.runs):
-        return []
+        return [], []
     columns = usable_columns(problem.model, problem.runs)
     read = [v for v in variables(problem, point, columns) if in_time or not v.clock]
     table = sum(map(len, problem.runs)) < TABLE and not any(map(is_series, problem.runs))
@@ -257,8 +268,13 @@ def _follows(
     # Of few rows no chance is small: it is that of naming anything in poses.
     chance = LEVELS.chance if table else LEVELS.misfit
     found = [s for s in every if s.p_value < chance and s.share > LEVELS.share]
+    one = {v.name: v for v in read}
+    by_chance = [
+        s for s in found if over and not more_than_courses_do(s, clipped, one[s.name], over)
+    ]
+    by_chance.sort(key=lambda s: -s.share)
+    found = [s for s in found if s not in by_chance]
     if found and not table:
-        one = {v.name: v for v in read}
         beside = [
             s
             for f in found
@@ -272,13 +288,13 @@ def _follows(
         ]
         found = [s for s in beside if s.p_value < chance and s.share > LEVELS.share]
     if not found:
-        return []
+        return [], by_chance
     # In the order of the record lies whatever was changed with it: what has a name comes first.
     clocks = {v.name for v in read if v.clock}
     most = (1 - LEVELS.alike) * max(s.share for s in found)
     best = max(found, key=lambda s: (s.share > most and s.name not in clocks, s.share))
     where = f"{100 * best.share:.0f} % of it follows {best.name}"
-    return [Finding(where, best.p_value, best.share)]
+    return [Finding(where, best.p_value, best.share)], by_chance
 
 
 def _taken(problem: Problem, point: Point) -> Array:

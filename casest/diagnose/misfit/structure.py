@@ -28,6 +28,9 @@ FEWEST, WANTED, SHORTEST = 8, 24, 4
 FEW_ROWS, MANY = 12, 100
 #: Share of the rows over which the size of a table's noise is told, from the row's neighbours.
 NEIGHBOURS = 0.6
+#: Places at most to which a residual with a slow course is moved along the record, and the share
+#: from which on one is told from none.
+PLACES, LEAST_SHARE = 99, 1e-3
 #: Where Imhof's integrand is asked: it is smooth in log u, and nothing at both ends.
 LOGS = np.linspace(-25.0, 15.0, 801)
 #: Share of a row's variance that the fit leaves, at least.
@@ -67,6 +70,40 @@ def structures(
         for v, k in zip(variables, orders, strict=True)
     ]
     return sorted((f for f in found if f is not None), key=lambda f: f.p_value)
+
+
+def more_than_courses_do(
+    found: Structure, residuals: Sequence[Array], variable: Variable, samples: int
+) -> bool:
+    """Does a residual with a course over so many samples follow a variable because of its values?
+
+    Two slow courses go together for a while, whatever they are of. Moved along the record, and back
+    from its end, a residual (N, m) of each run keeps its own and loses all that the variable does
+    to it: by whole lengths of the course, or of the variable where that changes sooner. The
+    share where it belongs is one more of those shares, or not: Student's t of their log odds.
+    """
+    from scipy.special import logit, stdtr
+
+    order, r = order_of(variable), np.concatenate(residuals)
+    step = min(samples, _length(np.concatenate(variable.values)))
+    there_and_back = np.concatenate([r, r[::-1]])
+    moved = np.arange(step, 2 * len(r) - step + 1, step)
+    if len(moved) < 2:
+        return False
+    moved = moved[np.linspace(0, len(moved) - 1, min(PLACES, len(moved))).astype(int)]
+    placed = [_of_means(found.name, np.roll(there_and_back, k, axis=0)[order], 1) for k in moved]
+    shares = [found.share, *(s.share for s in placed if s is not None)]
+    own, *others = logit(np.clip(shares, LEAST_SHARE, 1 - LEAST_SHARE))
+    spread = float(np.std(others, ddof=1)) * float(np.sqrt(1 + 1 / len(others)))
+    t = (own - float(np.mean(others))) / max(spread, 1e-9)
+    return bool(stdtr(len(others) - 1, -t) < LEVELS.chance)
+
+
+def _length(x: Array) -> int:
+    """Samples from a high to the next low of a series (N,), about: half of its power is slower."""
+    power = np.abs(np.fft.rfft(np.concatenate([x, x[::-1]]) - x.mean())[1 : len(x)]) ** 2
+    below = np.cumsum(power)
+    return int(np.ceil(len(x) / (1 + np.searchsorted(below, below[-1] / 2))))
 
 
 def order_of(variable: Variable) -> Index:
