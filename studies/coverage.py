@@ -86,10 +86,10 @@ def lines(n: int, size: Size) -> Callable[[np.random.Generator], Drawn]:
 
 
 def slow(
-    n: int, memory: float, *, spikes: float = 0.0, timed: bool = True
+    n: int, memory: float, *, spikes: float = 0.0, timed: bool = True, smooth: bool = False
 ) -> Callable[[np.random.Generator], Drawn]:
-    """A slow input; of the noise 0.6 is forgotten as exp(−k/memory), the rest is white, and a share
-    of the readings is thirty times as far off."""
+    """A slow input; of the noise 0.6 is forgotten as exp(−k/memory), or is `smooth`: that averaged
+    once more alike; the rest is white, and a share of the readings is thirty times as far off."""
 
     def drawn(rng: np.random.Generator) -> Drawn:
         t = np.arange(n)
@@ -97,7 +97,13 @@ def slow(
         kept = np.exp(-1 / memory)
         kicks = rng.standard_normal(n) * np.sqrt(1 - kept**2)
         kicks[0] = rng.standard_normal()
-        noise = np.sqrt(0.6) * lfilter([1], [1, -kept], kicks)
+        course = lfilter([1], [1, -kept], kicks)
+        if smooth:
+            long = lfilter([1], [1, -kept], rng.standard_normal(n + 40 * int(memory)))
+            course = lfilter([1], [1, -kept], long)[-n:] * np.sqrt(
+                (1 - kept**2) ** 3 / (1 + kept**2)
+            )
+        noise = np.sqrt(0.6) * course
         noise += np.sqrt(0.4) * rng.standard_normal(n) + 30 * (rng.random(n) < spikes)
         signals = {"x": x[:, None], "y": (1 + 2 * x + 0.1 * noise)[:, None]}
         run = Run.raw("slow", signals, units={}, time=0.01 * t if timed else None)
@@ -176,6 +182,8 @@ ROWS: dict[str, Callable[[np.random.Generator], Drawn]] = {
     "line, 200 samples, memory of 50": slow(200, 50),
     "line, 1000 samples, memory of 50": slow(1000, 50),
     "line, 16 000 samples, memory of 50": slow(16_000, 50),
+    "line, 1000 samples, smooth, memory of 30": slow(1000, 30, smooth=True),
+    "line, 4000 samples, smooth, memory of 100": slow(4000, 100, smooth=True),
     "line, 300 rows without a time, memory of 8": slow(300, 8, timed=False),
     "line, 90 rows without a time, memory of 8": slow(90, 8, timed=False),
     "line, 90 samples, memory of 8": slow(90, 8),

@@ -220,8 +220,18 @@ def _proved(
     sensor: Sensor, state: State[Fit], declared: Fit, before: Estimate
 ) -> tuple[State[Fit], Estimate]:
     """The end of a search: rivals of what was added, and the estimate with it."""
-    state = with_rivals(sensor, _without_events_of_a_course(sensor, state))
-    return (state, before) if state.fit is declared else certified(sensor, state, before)
+    alone = _without_events_of_a_course(sensor, state)
+    state = with_rivals(sensor, alone)
+    if state.fit is declared:
+        return state, before
+    proved, after = certified(sensor, state, before)
+    if 0 < len(proved.kept) < len(state.kept):
+        # What stays was judged beside what went.
+        there = {id(r) for r in alone.refused}
+        stale = {id(r) for r in state.refused if id(r) not in there}
+        others = tuple(r for r in proved.refused if id(r) not in stale)
+        proved = with_rivals(sensor, replace(proved, refused=others))
+    return proved, after
 
 
 def _without_events_of_a_course(sensor: Sensor, state: State[Fit]) -> State[Fit]:
@@ -262,8 +272,7 @@ def _found(sensor: Sensor, state: State[Fit], kept: Kept, after: Estimate) -> Fo
         if r.what.label not in added
     }
     chance = chance_alone(sensor, state, kept)
-    if sensor.linear(state.fit).coloured:
-        chance = max(chance, chance_of_sizes(candidate.label, after))
+    chance = max(chance, chance_of_sizes(candidate.label, after))
     return Found(candidate, chance, fall, names, rivals)
 
 
@@ -303,8 +312,11 @@ def _undecided(sensor: Sensor, state: State[Fit]) -> Undecided | None:
     # Of a pair each explains something beside the other: neither does alone what both do.
     alone = [e for e in state.open if len(e.trials) == 1] or state.open[:1]
     there = {k.what.label for k in state.kept}
+    unlike = {r.what.label for r in state.refused if r.another}
     shares = dict[tuple[str, ...], float]()
     for evidence in (e for e in alone if not there.issuperset(e.families)):
+        if unlike.intersection(t.what.label for t in evidence.trials):
+            continue
         share = _share(sensor, state, evidence.trials)
         if share is not None:
             shares[evidence.families] = share

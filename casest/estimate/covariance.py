@@ -12,7 +12,7 @@ from casest.declaration.shapes import Array
 from casest.estimate.correlation import batches, is_series
 from casest.estimate.remembering import remembering
 from casest.estimate.spectrum import Part, Stretch, by_frequency, noise_spectrum
-from casest.estimate.spells import by_spells, contradicted
+from casest.estimate.spells import SPELLS, at_most, by_spells, contradicted
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.sums import squares_of_batches, squares_of_gradients
 from casest.leastsquares.weights import has_noise_effects, variance_factor
@@ -160,8 +160,9 @@ def _sandwich(
         robust, told_by = problem.judged[2]
         return robust, told_by
     bread = inverse_normal(R, free)
-    robust, told_by = _baked(problem, point, bread, correlated_over)
-    robust = _beside_spells(robust, by_spells(problem, point, bread))
+    several = by_spells(problem, point, bread)
+    robust, told_by = _baked(problem, point, bread, correlated_over, several)
+    robust = _beside_spells(robust, several)
     problem.judged[:] = [point, asked, (robust, told_by)]
     return robust, told_by
 
@@ -179,7 +180,11 @@ def _beside_spells(robust: Spread, several: Sequence[tuple[Array, Array]]) -> Sp
 
 
 def _baked(
-    problem: Problem, point: Point, bread: Array, correlated_over: float
+    problem: Problem,
+    point: Point,
+    bread: Array,
+    correlated_over: float,
+    several: Sequence[tuple[Array, Array]],
 ) -> tuple[Spread, Array | None]:
     if correlated_over <= 1:
         middle, told_by = squares_of_gradients(problem, point, bread)
@@ -194,7 +199,11 @@ def _baked(
     parts = [part for block in stretches(problem, point) for part in by_frequency(block, bread)]
     # Each of the two has colours that it does not know: pink noise, and a knee with little below.
     smooth = np.asarray(bread @ _by_frequencies(problem, parts) @ bread)
-    return no_less(Spread(*remembering(parts, bread)), Spread(smooth)), None
+    found = no_less(Spread(*remembering(parts, bread)), Spread(smooth))
+    own = np.diag(found.covariance)
+    rows = sum(map(len, problem.runs)) // SPELLS[0]
+    less = at_most(own, several, rows, correlated_over)
+    return replace(found, covariance=as_plain(found.covariance, less, less < own)), None
 
 
 def _by_frequencies(problem: Problem, parts: Sequence[Part]) -> Array:

@@ -1,11 +1,12 @@
 """Coloured noise of a record that is not many of its memories long.
 
-White noise and one part that is forgotten as exp(−k/memory): two numbers of its colour, as much as
-there is to see where there is little to average over. What a fit has taken of the noise, most of
-it slow, is allowed for by what it leaves of each frequency; what such a record leaves open of the
-colour by all colours, each as likely as Whittle's likelihood makes it (all are equally likely
-before). A variance is their geometric mean, and its degrees of freedom are those of Student's t
-that reaches as far as the mixture of normal errors does.
+White noise and one part that is forgotten as exp(−k/memory), or is smoother, as if that had been
+averaged once more alike (of errors that a lag leaves, or a plant that moves slowly): two numbers of
+its colour, as much as there is to see where there is little to average over. What a fit has taken
+of the noise, most of it slow, is allowed for by what it leaves of each frequency; what such a
+record leaves open of the colour by all colours, each as likely as Whittle's likelihood makes it
+(all are equally likely before). A variance is their geometric mean, and its degrees of freedom are
+those of Student's t that reaches as far as the mixture of normal errors does.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from casest.estimate.spectrum import LEFT, Part
 #: stretch; shares of the variance that remember.
 MEMORIES = 12
 SHARES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.95, 0.98, 1.0)
+#: Of the longest stretch the longest memory of smooth noise: beyond it that is a few waves.
+SMOOTH = 0.1
 #: Frequencies that count one by one, and bands of the others.
 SINGLE, BANDS = 24, 60
 #: What the intervals hold; degrees of freedom at least, and from which on they are as many as any.
@@ -100,8 +103,10 @@ def _shapes(frequency: Array, edges: NDArray[np.int_], longest: int) -> Array:
     each = []
     for memory in np.geomspace(1.0, longest, MEMORIES):
         a = np.exp(-1 / memory)
-        power = (1 - a**2) / (1 - 2 * a * np.cos(2 * np.pi * frequency) + a**2)
-        each.append(np.add.reduceat(power, edges) / (ends - edges))
+        powers = [(1 - a**2) / (1 - 2 * a * np.cos(2 * np.pi * frequency) + a**2)]
+        if memory < SMOOTH * longest:
+            powers.append(powers[0] ** 2 * (1 - a**2) / (1 + a**2))
+        each += [np.add.reduceat(power, edges) / (ends - edges) for power in powers]
     found = [share * one + 1 - share for one in each for share in SHARES]
     return np.array(found)
 

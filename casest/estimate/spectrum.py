@@ -222,7 +222,9 @@ def _most_likely(shapes: Array, mean: Array, count: Array) -> Array:
     (here, share), length = at(b), np.ones(len(b))
     for _ in range(50):
         gradient = (count * (1 - share)) @ shapes
-        hessian = shapes.T @ ((count * share)[:, :, None] * shapes) + small
+        hessian = shapes.T @ ((count * share)[:, :, None] * shapes)
+        # Of one power that dwarfs all others one direction is told: so much of another is known.
+        hessian = hessian + np.trace(hessian, axis1=1, axis2=2)[:, None, None] * small + small
         step, length[:] = np.linalg.solve(hessian, gradient[:, :, None]), 1.0
         after, share = at(b - step)
         while (longer := ~(after <= here) & (length > 1e-6)).any():

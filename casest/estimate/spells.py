@@ -23,6 +23,8 @@ SPELLS, ROWS = (10, 20, 40), 10
 CHANCE = 0.01
 #: Spells whose gradients count as so many equal ones at least: of fewer nobody knows a scatter.
 FEWEST = 3.0
+#: Correlation times of the noise in a spell from which on what spells scatter is all that it does.
+MANY_TIMES = 10
 #: Unknowns up to which all that each spell says is kept at once.
 MOST = 200
 
@@ -98,3 +100,18 @@ def contradicted(
         found, free = np.where(better, own, found), np.where(better, freedom, free)
         more |= better
     return more, found, free
+
+
+def at_most(
+    variance: Array, several: Sequence[tuple[Array, Array]], length: int, correlated_over: float
+) -> Array:
+    """Variances (n,) no larger than the longest spells, of so many rows, could say: a spectrum that
+    is drawn on below all frequencies that a fit leaves may be anything there. As they are where a
+    spell is not many correlation times long."""
+    from scipy.special import chdtri
+
+    if not several or length < MANY_TIMES * correlated_over:
+        return variance
+    own, freedom = several[0]
+    least = chdtri(np.maximum(freedom, FEWEST), 1 - CHANCE) / np.maximum(freedom, FEWEST)
+    return np.where((freedom >= FEWEST) & (own > 0), np.minimum(variance, own / least), variance)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Protocol, TypeVar
@@ -71,12 +72,12 @@ def sentence(result: Closed) -> str:
 
 
 def _elsewhere(result: Closed) -> str:
-    """That a record which was given to be foretold is foretold worse with what was added."""
+    """That what was held out, or a record that was given, is foretold worse with what was added."""
     before, after = result.before.rmse_holdout, result.after.rmse_holdout
-    if result.holdout is UNSET or not result.effects or before is None or after is None:
+    if not result.effects or before is None or after is None or after <= (1 + WORSE) * before:
         return ""
-    worse = after > (1 + WORSE) * before
-    return f", but {', '.join(result.holdout)} is foretold worse with it" if worse else ""
+    given = "what was held out" if result.holdout is UNSET else ", ".join(result.holdout)
+    return f", but {given} is foretold worse with it"
 
 
 def _which(left: Unexplained) -> str:
@@ -262,16 +263,17 @@ def undecided(
             yield f"{label} would move the parameters: {_moved_by(shifts, parameters)}"
     yield from (f"to tell {words}" for words in left.would_separate[:NAMED])
     if name := to_be_asked(left, command):
-        yield f"who knows which of them is there says so, as --effects {name}"
+        yield f"who knows which of them is there says so, as --effects {shlex.quote(name)}"
 
 
 def to_be_asked(left: Unexplained, command: str) -> str:
-    """A shipped effect, the likeliest, of those that none was added of; empty where there is none
-    that explains what counts, or where the `command` asked for some."""
+    """A shipped effect, the likeliest, of those that none was added of, as `--effects` takes it;
+    empty where there is none that explains what counts, or where the `command` asked for some."""
     shipped = set() if "--effects" in command else {e.name for e in CATALOGUE}
     enough = (left.share or 0.0) >= LEVELS.share
-    names = [label.partition("(")[0] for label in (left.one_of if enough else left.would_move)]
-    return next((name for name in names if name in shipped), "")
+    labels = left.one_of if enough else left.would_move
+    asked = (label for label in labels if label.partition("(")[0] in shipped)
+    return next(asked, "")
 
 
 def _moved_by(shifts: Shifts, parameters: Mapping[str, Parameter]) -> str:

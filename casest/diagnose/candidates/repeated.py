@@ -123,16 +123,18 @@ class Reads:
         return late and f"column is {late} at other times: what follows it could be a lag of it"
 
     def _made_of(self, x: Array) -> tuple[str, str] | None:
-        """A reading of one element and another column of which it is the quotient or product."""
+        """A signal of one element and another column of which it is the difference, or of a reading
+        the quotient or product."""
         single = [s for s in self.signals if s.elements.shape[1] == 1]
         others = {s.name: s.elements[:, 0] for s in single} | dict(self.columns)
-        for reading, (name, y) in product(single, others.items()):
-            if reading.input or name == reading.name or y is x or np.array_equal(x, y):
+        for one, (name, y) in product(single, others.items()):
+            if name == one.name or y is x or np.array_equal(x, y):
                 continue
-            read = reading.elements[:, 0]
-            # Of the three numbers that one was computed which has the reading's noise.
-            if is_quotient(x, read, y) and _noise_alike(x, read) > _noise_alike(y, read):
-                return reading.name, name
+            read = one.elements[:, 0]
+            made = is_error(x, read, y) or (not one.input and is_quotient(x, read, y))
+            # Of the three numbers that one was computed which has the signal's noise.
+            if made and _noise_alike(x, read) > _noise_alike(y, read):
+                return one.name, name
         return None
 
     def _error_of(self, x: Array) -> tuple[str, str] | None:

@@ -66,14 +66,14 @@ def eliminated(subject: Subject[F], state: State[F]) -> State[F]:
         for kept in state.kept:
             base = subject.without(state.fit, kept.what)
             found = None if base is None else _beside_the_others(subject, state, kept, base)
-            if found is not None:
+            # Another that is more than its name says where this one goes does its work besides.
+            if found is not None and base is not None and not subject.unlike(base):
                 weak.append((*found, kept, base))
         if len(state.kept) == count == 1:  # the rest of it was asked when it was added
             weak = [w for w in weak if w[1] == TOGETHER]
         if not weak:
             return state
         _, why, gone, fit = min(weak, key=lambda w: w[0])
-        assert fit is not None
         state = replace(state.dropping(gone, why), fit=fit)
         if why == TOGETHER:
             state = replace(state, open=(gone.evidence, *state.open))

@@ -83,6 +83,10 @@ class Subject(Protocol[F]):
         """The fit without something that was added."""
         ...
 
+    def unlike(self, fit: F) -> str:
+        """Why an effect in a fit is not what its name says there; else empty."""
+        return ""
+
     def instead(self, fit: F, what: Any, added: Sequence[Trial]) -> F | str:
         """The fit with these in the place of something that was added, from where it is."""
         return ""

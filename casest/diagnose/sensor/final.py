@@ -55,8 +55,10 @@ def certified(sensor: Sensor, state: State[Fit], before: Estimate) -> tuple[Stat
         fit = sensor.without(state.fit, last.what)
         if fit is None:
             return state, before
-        state = replace(left_in(state, fit), open=(last.evidence, *state.open))
-        state = replace(state, last=ranked(sensor, fit))  # what it leaves, it explains again
+        # What it leaves, it explains again, under its name or not.
+        open_ = state.open if ANOTHER in why else (last.evidence, *state.open)
+        state = replace(left_in(state, fit), open=open_)
+        state = replace(state, last=ranked(sensor, fit))
 
 
 def left_in(state: State[Fit], fit: Fit) -> State[Fit]:
@@ -134,9 +136,11 @@ def chance_of_sizes(label: str, after: Estimate) -> float:
 
 
 def _sizes(attached: Attached) -> set[str]:
-    """Parameters of an effect that are none where it is none."""
+    """Parameters of an effect that are none where it is none: those that are searched over a grid
+    only where there are no others (a lag)."""
     searched = dict(attached.effect.profile)
-    return {p.name for p in attached.parameters if p.name.rpartition(".")[2] not in searched}
+    every = {p.name: p.name.rpartition(".")[2] in searched for p in attached.parameters}
+    return {name for name, grid in every.items() if not grid} or set(every)
 
 
 def _places(names: set[str], after: Estimate) -> Index:

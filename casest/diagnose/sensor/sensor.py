@@ -260,6 +260,10 @@ class Sensor(Subject[Fit]):
         less = _less(fit, what)
         return self.fitted(less.model, less.values)
 
+    def unlike(self, fit: Fit) -> str:
+        """Why an effect in a fit is not what its name says there; else empty."""
+        return another(fit.model, fit.values, self.model)[1]
+
     def instead(self, fit: Fit, what: Candidate, added: Sequence[Trial]) -> Fit | str:
         """The fit with these in the place of an effect that was added, from where it is."""
         return "it is no effect" if what.freed else self._refit(_less(fit, what), added)

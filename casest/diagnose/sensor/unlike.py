@@ -73,6 +73,7 @@ def smooth(before: Linear, after: Linear, added: Sequence[Candidate], met: Array
     z = (met - met.mean()) / max(float(np.abs(met - met.mean()).max()), 1e-300)
     powers = np.concatenate([(z**k * before.root).reshape(-1, 1) for k in POWERS], axis=1)
     Q, r = before.basis, before.residual.ravel()
+    r = r - Q @ (Q.T @ r)  # a cause that was taken out just now: nothing was fitted again
     beyond = powers - Q @ (Q.T @ powers)
     size = np.linalg.norm(beyond, axis=0)
     kept = size > LEVELS.survives * np.linalg.norm(powers, axis=0)  # those that it has not already
