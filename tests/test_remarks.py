@@ -218,3 +218,15 @@ def test_without_redundancy_rest_intervals_are_all_that_speaks(tmp_path):
     assert run([*command, *options]) == 0
     result = json.loads((tmp_path / "o" / "result.json").read_text(encoding="utf-8"))
     assert any("nothing checks the model" in note for note in result["notes"])
+
+
+@pytest.mark.parametrize(("digits", "said"), [(4, True), (0, False)])
+def test_rows_that_are_there_twice_are_a_copy_where_readings_scatter_by_many_digits(digits, said):
+    """18 rows, and the same 18 once more; rounded to more than the noise any two may be alike."""
+    rng = np.random.default_rng(7)
+    given = np.linspace(0, 50, 18)
+    reading = np.round(0.2 + 0.97 * given + 0.3 * rng.standard_normal(18), digits)
+    signals = {"reference": np.tile(given, 2)[:, None], "reading": np.tile(reading, 2)[:, None]}
+    found = attempt(find_model("linear"), [Run.raw("twice", signals, units={})])
+    copied = "rows 18 to 35 of twice are rows 0 to 17 again, to the last digit"
+    assert noted(found, copied) is said

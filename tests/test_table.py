@@ -229,8 +229,6 @@ def test_a_bad_cell_is_recorded_with_row_and_text_and_raises_nothing(
         ("t,v\n0,1\n1,2,9\n2,3\n", "row 1 (line 3) has 3 cells where the table has 2: '1,2,9'"),
         ("Fs,1\nt,v,w\n0,1,2\n1,2\n2,3,4\n", "row 1 (line 4) has 2 cells"),
         ("t,v,w\n0,1,2\n1,2,3\n2,3", "cut off: delete it"),
-        ("t,v,v\n0,1,2\n1,2,3\n", "2 columns are named 'v'"),
-        ("t,v [g],v [m/s^2]\n0,1,2\n1,2,3\n", "two columns are named 'v'"),
         ("a,b,c\n0,1,2,3\n1,2,3,4\n", "the header names 3 columns and the rows have 4 cells"),
         (b"\x00\x01\x02\x03" * 50, "is no text but binary"),
     ],
@@ -239,6 +237,17 @@ def test_a_broken_file_is_refused_in_one_line(
     tmp_path: Path, text: str | bytes, words: str
 ) -> None:
     assert words in error_of(tmp_path, text)
+
+
+@pytest.mark.parametrize("header", ["t,v,v,w", "t,v [g],v [m/s^2],w"])
+def test_columns_of_one_name_are_told_apart_by_a_number(tmp_path: Path, header: str) -> None:
+    """A file is not refused for columns that nobody asks for, and the name stands for none."""
+    path = tmp_path / "twice.csv"
+    path.write_text(f"{header}\n0,1,2,3\n1,2,3,4\n")
+    table = read_table(path)
+    assert list(table.columns) == ["t", "v (1)", "v (2)", "w"]
+    assert table.columns["v (2)"].values.tolist() == [2, 3]
+    assert "2 columns are named 'v': they are 'v (1)' to 'v (2)' here" in table.notes
 
 
 def test_a_missing_file_suggests_its_neighbours(tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ import csv
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -312,7 +311,6 @@ def _columns(body: _Body, names: list[str] | None) -> tuple[list[Column], int]:
     fast = _fast(body)
     if fast is not None:
         headers = _headers(names, fast.shape[1])
-        _refuse_duplicates(body.file, headers)
         cells = (_texts_if_needed(body, fast[:, i], i) for i in range(fast.shape[1]))
         return [
             numeric_column(h, fast[:, i], c)
@@ -324,7 +322,6 @@ def _columns(body: _Body, names: list[str] | None) -> tuple[list[Column], int]:
     points = decimals and any(_plain_point(cell) for row in rows for cell in row)
     texts = [list(column) for column in zip(*rows, strict=True)]
     kept = [i for i, t in enumerate(texts) if any(t) or (names and i < len(names) and names[i])]
-    _refuse_duplicates(body.file, [headers[i] for i in kept])
     typed = [_typed(headers[i], texts[i], body.layout, points) for i in kept]
     return typed, len(texts) - len(kept)
 
@@ -339,12 +336,6 @@ def _headers(names: list[str] | None, width: int) -> list[str]:
     given = list(names or [])[:width]
     given += [""] * (width - len(given))
     return [name or str(i) for i, name in enumerate(given)]
-
-
-def _refuse_duplicates(file: str, headers: Iterable[str]) -> None:
-    for name, count in Counter(headers).items():
-        if count > 1:
-            raise DataError(f"{file}: {count} columns are named '{name}'; rename all but one")
 
 
 def _fast(body: _Body) -> NDArray[np.float64] | None:

@@ -69,8 +69,10 @@ def refuse_unordered(file: str, column: str, time: Array, rows: NDArray[np.int_]
     if wrong.size:
         at = int(wrong[0])
         what = "repeats" if time[at + 1] == time[at] else "goes backward from"
+        again = int(np.sum(np.diff(time) == 0))
+        some = f", {again} of which repeat a time" if 0 < again < wrong.size else ""
         raise DataError(
             f"{file}: column {column} row {rows[at + 1]}: time {time[at + 1]:.9g} s {what} "
-            f"{time[at]:.9g} s in row {rows[at]} ({wrong.size} such rows); mark separate records "
-            f"with a column run, or give --rate HZ to count samples instead"
+            f"{time[at]:.9g} s in row {rows[at]} ({wrong.size} such rows{some}); mark "
+            f"separate records with a column run, or give --rate HZ to count samples instead"
         )

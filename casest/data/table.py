@@ -6,8 +6,9 @@ import difflib
 import gzip
 import os
 import zlib
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -43,8 +44,9 @@ def read_table(path: str | os.PathLike[str]) -> Table:
     ROS bags and PX4 logs hold several topics, of which one is named behind the file:
     `flight.bag:/imu/data`; several with commas between them are put on the slowest one's clock.
 
-    Raises DataError where the file is missing, empty, of another format, has rows of unequal
-    width or two columns of one name. Bad cells raise nothing here: see `Column.bad`.
+    Columns of one name are told apart by a number. Raises DataError where the file is missing,
+    empty, of another format or has rows of unequal width. Bad cells raise nothing here: see
+    `Column.bad`.
     """
     try:
         file, contents = _contents(path)
@@ -64,17 +66,34 @@ def table_of(data: Any, name: str) -> Table:
 
 def _checked(name: str, file: str, contents: Contents) -> Table:
     """The table of what a reader found; DataError where it holds nothing."""
-    columns = {column.name: column for column in contents.columns}
-    if len(columns) < len(contents.columns):
-        names = [column.name for column in contents.columns]
-        twice = next(name for name in names if names.count(name) > 1)
-        raise DataError(f"{file}: two columns are named '{twice}'; rename one of them")
+    apart, notes = _told_apart(contents.columns)
+    columns = {column.name: column for column in apart}
     if not columns:
         raise DataError(f"{file}: holds no columns of numbers; check the export")
     n_rows = len(next(iter(columns.values())).values)
     if n_rows == 0:
         raise DataError(f"{file}: holds a header but no rows below it; check the export")
-    return Table(name, columns, tuple(contents.notes), contents.preamble, n_rows)
+    return Table(name, columns, (*contents.notes, *notes), contents.preamble, n_rows)
+
+
+def _told_apart(columns: Sequence[Column]) -> tuple[list[Column], list[str]]:
+    """Columns of which each has a name of its own, and what to say of those that had not: nobody
+    knows which one is meant by it, so that it stands for none."""
+    many, taken = Counter(column.name for column in columns), {column.name for column in columns}
+    found, notes, number = list[Column](), list[str](), Counter[str]()
+    for column in columns:
+        name = column.name
+        if many[name] > 1:
+            number[name] += 1
+            while (own := f"{name} ({number[name]})") in taken:
+                number[name] += 1
+            column = replace(column, name=own)
+        found.append(column)
+    for name, count in many.items():
+        if count > 1:
+            first, last = f"{name} (1)", f"{name} ({number[name]})"
+            notes.append(f"{count} columns are named '{name}': they are '{first}' to '{last}' here")
+    return found, notes
 
 
 def _contents(path: str | os.PathLike[str]) -> tuple[Path, Contents]:

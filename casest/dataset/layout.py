@@ -226,9 +226,8 @@ def _bound(
     """Columns and unit of each signal, the column of time, and the readings that hold them."""
     owner = {h: r for r in readings for h in r.headers}
     table = table_of(file.name, {header: np.zeros(0) for header in owner})
-    if len(table.columns) < sum(len(r.headers) for r in readings):
-        names = [name_and_unit(h)[0] for r in readings for h in r.headers]
-        twice = next(name for name in names if names.count(name) > 1)
+    names = [name_and_unit(h)[0] for r in readings for h in r.headers]
+    if twice := next((name for name in names if names.count(name) > 1), ""):
         raise DataError(f"{file.name}: two columns are named '{twice}'; rename one of them")
     named = dict(zip(table.columns, owner.values(), strict=True))
     refuse_unknown_names([table], signals, options)

@@ -24,6 +24,8 @@ from casest.solve.trust_region import trust_region
 
 #: Share of the squares of its unknowns, each alone, by which a direction moves a prediction at all.
 OPEN = 1e-10
+#: Standard deviations of the noise from which on what is foretold says nothing.
+NOTHING = 1e3
 #: Iterations of a fit that begins at the fit to everything, and gain (in σ²) that ends it.
 ITERATIONS, ENOUGH = 30, 1e-3
 
@@ -181,6 +183,8 @@ def _why(before: Estimate, rest: tuple[Run, ...], part: tuple[Run, ...]) -> str:
     if spread < LEVELS.uncertain * held.residual_count:
         return ""
     deviations = np.sqrt(spread / held.residual_count)
+    if not deviations < NOTHING:
+        return "nothing is foretold of the part"
     return f"the part is foretold to {deviations:.2g} standard deviations of the noise"
 
 

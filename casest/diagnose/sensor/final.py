@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import fdtrc, ndtr
+from scipy.special import fdtrc
 
 from casest.declaration.effect import Attached
 from casest.declaration.shapes import Array
 from casest.diagnose.evidence.linear import Index
+from casest.diagnose.formula.search import NAME as FORMULA
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol import Kept, State
 from casest.diagnose.protocol.elimination import on_its_own
@@ -26,8 +27,6 @@ from casest.leastsquares.kinds import noises
 
 #: Why an effect is not kept that the last fit makes nothing of.
 NO_SIZE = "in the end its size may as well be nothing"
-#: Chance of what is two standard deviations from none.
-TWO_SIDED = float(2 * ndtr(-LEVELS.apart))
 
 
 def certified(sensor: Sensor, state: State[Fit], before: Estimate) -> tuple[State[Fit], Estimate]:
@@ -55,8 +54,9 @@ def certified(sensor: Sensor, state: State[Fit], before: Estimate) -> tuple[Stat
         fit = sensor.without(state.fit, last.what)
         if fit is None:
             return state, before
-        # What it leaves, it explains again, under its name or not.
-        open_ = state.open if ANOTHER in why else (last.evidence, *state.open)
+        # What it leaves, it explains again: what has a name, under that name.
+        nameless = ANOTHER in why or last.what.label == FORMULA
+        open_ = state.open if nameless else (last.evidence, *state.open)
         state = replace(left_in(state, fit), open=open_)
         state = replace(state, last=ranked(sensor, fit))
 
@@ -103,24 +103,16 @@ def _at_fault(sensor: Sensor, state: State[Fit], after: Estimate) -> tuple[Kept 
 def _is_nothing(attached: Attached, after: Estimate) -> bool:
     """Is each of an effect's sizes within two standard deviations of none, were noise alike
     everywhere? Then only rows that count less, or a colour of the noise, had spoken for it. Or are
-    all of them together, by the standard deviations that are printed, and would not be if the other
-    effects were known? Then what came later has taken its place."""
-    sizes = _sizes(attached)
-    z = [np.abs(after.values[n]) / after.plain[n] for n in sizes if n in after.plain]
+    all of them together what chance may be, by the standard deviations that are printed? Of a
+    formula each term is one more that was looked for: none may be nothing."""
+    z = [np.abs(after.values[n]) / after.plain[n] for n in _sizes(attached) if n in after.plain]
     if z and all(bool(np.all(one < LEVELS.apart)) for one in z):
         return True
-    others = {p.name for a in after.model.effects if a is not attached for p in a.parameters}
-    own, rest = _places(sizes, after), _places(others, after)
-    both = np.concatenate([own, rest])
-    covariance = after.covariance[np.ix_(both, both)]
-    if not (own.size and rest.size) or not np.isfinite(covariance).all():
-        return False
-    n = len(own)
-    C, between, known = covariance[:n, :n], covariance[:n, n:], covariance[n:, n:]
-    alone = C - between @ np.linalg.lstsq(known, between.T, rcond=1e-12)[0]
-    values, freedom = after.point.x[own], np.array(after.effective_freedom)[own]
-    by_chance = [_by_chance(values, c, float(freedom.min())) for c in (C, alone)]
-    return by_chance[0] > TWO_SIDED > by_chance[1]
+    if attached.effect.name == FORMULA:
+        z = [np.abs(after.values[n]) / after.std[n] for n in _sizes(attached)]
+        if any(bool(np.any(one < LEVELS.apart)) for one in z):
+            return True
+    return chance_of_sizes(attached.label, after) > LEVELS.chance
 
 
 def chance_of_sizes(label: str, after: Estimate) -> float:
