@@ -268,7 +268,7 @@ def test_what_is_to_be_said_with_effects_is_a_name_that_it_takes():
     moves = {"radius": {}, "temperature_bias(temp)": {}}
     left = Unexplained(0.1, "", list(moves), moves, [])
     (words,) = undecided(left, {})
-    assert words.endswith("--effects temperature_bias")
+    assert words.endswith("--effects 'temperature_bias(temp)'")
     assert not list(undecided(Unexplained(0.1, "", ["radius"], {"radius": {}}, []), {}))
 
 

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
+from scipy.stats import chi2
 
 from casest import calibrate
-from casest.estimate.spells import CHANCE, SPELLS, contradicted
+from casest.estimate.spectrum import _most_likely
+from casest.estimate.spells import CHANCE, SPELLS, at_most, contradicted
 
 
 def record(rng, path, rows, scatter):
@@ -63,3 +66,41 @@ def test_chance_alone_contradicts_a_variance_as_seldom_as_it_says(freedom):
 def test_few_spells_that_say_all_contradict_nothing():
     more, _, _ = contradicted(np.ones(1), [(np.full(1, 50.0), np.full(1, 1.5))])
     assert not more.any()
+
+
+@pytest.mark.long
+def test_smooth_noise_is_as_uncertain_as_it_is(tmp_path):
+    """Noise that was averaged twice (20 samples each): 30 records. Before, the standard deviations
+    of the offset were twice what the values scatter by."""
+    off, said = [], []
+    kept = np.exp(-1 / 20)
+    for seed in range(60):
+        rng = np.random.default_rng([9, seed])
+        t = np.arange(1500)
+        noise = lfilter([1], [1, -kept], lfilter([1], [1, -kept], rng.standard_normal(2500)))[1000:]
+        x = np.sin(2 * np.pi * 6 * t / len(t))
+        table = np.column_stack([0.01 * t, x, 1 + 2 * x + 0.001 * noise])
+        np.savetxt(tmp_path / "a.csv", table, delimiter=",", header="t,reference,reading",
+                   comments="")  # fmt: skip
+        found = calibrate("linear", tmp_path / "a.csv")
+        off.append(float(found.values["offset"]) - 1)
+        said.append(float(found.std["offset"]))
+    scatter = float(np.sqrt(np.mean(np.square(off))))
+    assert 0.8 * scatter < np.median(said) < 1.3 * scatter
+
+
+def test_what_a_spectrum_draws_on_beyond_its_bands_is_no_more_than_spells_scatter():
+    """Chi-square's own quantile: of nine degrees of freedom a variance is at most 4.3 times one."""
+    several = [(np.array([1.0, 1.0]), np.array([9.0, 9.0]))]
+    most = 9 / chi2.ppf(CHANCE, 9)
+    variance = np.array([100.0, 2.0])
+    np.testing.assert_allclose(at_most(variance, several, 500, 10.0), [most, 2.0])
+    np.testing.assert_allclose(at_most(variance, several, 99, 10.0), variance)
+
+
+def test_a_spectrum_of_which_most_powers_are_nothing_has_a_slope_all_the_same():
+    """Eight plateaus of rows that only repeat: it was a singular matrix."""
+    mean = np.full((12, 1), 1e-300)
+    mean[[2, 7]] = 3e-3
+    line = np.column_stack([np.ones(12), np.linspace(-3, -1, 12)])
+    assert np.isfinite(_most_likely(line, mean, np.ones((12, 1)))).all()

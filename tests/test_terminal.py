@@ -13,6 +13,7 @@ import click
 import numpy as np
 import pytest
 import simulators as sim
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from casest.cli import commands, run
@@ -188,11 +189,11 @@ def test_a_long_command_continues_as_a_shell_reads_it():
 
 
 def test_after_a_misfit_the_next_command_asks_for_a_cause_and_corrects_nothing(tmp_path, capsys):
-    """A gain that changes at 6 and noise: several bends explain a part of it, none all."""
-    x = np.linspace(0, 10, 60)
-    noise = 0.02 * np.random.default_rng(5).standard_normal(60)
-    y = 2 * x + 1 + 0.5 * np.maximum(x - 6, 0) + noise
-    np.savetxt(tmp_path / "t.csv", np.c_[x, y], "%.6f", ",", header="x,y", comments="")
+    """A drift beside slow noise: that, or a step, explains most of it, and so may the noise."""
+    rng, t = np.random.default_rng(4), 0.5 * np.arange(600)
+    x, slow = rng.uniform(0, 10, 600), gaussian_filter1d(rng.standard_normal(600), 40)
+    y = 1 + 2 * x + 0.0004 * t + 0.03 * slow / slow.std() + 0.01 * rng.standard_normal(600)
+    np.savetxt(tmp_path / "t.csv", np.c_[t, x, y], "%.6f", ",", header="t [s],x,y", comments="")
     words = ["close", "linear", str(tmp_path / "t.csv"), "--columns", "reference=x"]
     words += ["--columns", "reading=y", "-o", str(tmp_path / "out")]
     assert run(words) == 0

@@ -5,8 +5,8 @@ averaged once more alike (of errors that a lag leaves, or a plant that moves slo
 its colour, as much as there is to see where there is little to average over. What a fit has taken
 of the noise, most of it slow, is allowed for by what it leaves of each frequency; what such a
 record leaves open of the colour by all colours, each as likely as Whittle's likelihood makes it
-(all are equally likely before). A variance is their geometric mean, and its degrees of freedom are
-those of Student's t that reaches as far as the mixture of normal errors does.
+(all of one kind are equally likely before). A variance is their geometric mean, and its degrees of
+freedom are those of Student's t that reaches as far as the mixture of normal errors does.
 """
 
 from __future__ import annotations
@@ -24,8 +24,12 @@ from casest.estimate.spectrum import LEFT, Part
 #: stretch; shares of the variance that remember.
 MEMORIES = 12
 SHARES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.95, 0.98, 1.0)
-#: Of the longest stretch the longest memory of smooth noise: beyond it that is a few waves.
-SMOOTH = 0.1
+#: Of the longest stretch the longest memory of smooth noise, beyond which that is a few waves; and
+#: by how much finer these are tried: what is slow goes with their fourth power.
+SMOOTH, FINER = 0.1, 2
+#: How likely any smooth colour is before, of which there are more than are met: a record that is
+#: long enough says so.
+SELDOM = 0.1
 #: Frequencies that count one by one, and bands of the others.
 SINGLE, BANDS = 24, 60
 #: What the intervals hold; degrees of freedom at least, and from which on they are as many as any.
@@ -92,7 +96,9 @@ def _axis(parts: list[Part]) -> _Axis:
     told: Array = np.bincount(band, left).astype(float)
     told = np.where(told > LEFT * np.bincount(band), told, 0.0)
     squares = np.where(told > 0, np.bincount(band, power), 0.0)
-    weight, sizes = _likely(shapes, told, squares)
+    smooth = np.arange(len(shapes)) >= MEMORIES * len(SHARES)
+    before = np.where(smooth, SELDOM / smooth.sum(), (1 - SELDOM) / (~smooth).sum())
+    weight, sizes = _likely(shapes, told, squares, before)
     bands = np.split(band, np.cumsum(lengths)[:-1])
     return _Axis(parts, bands, weight, shapes * sizes[:, None])
 
@@ -100,22 +106,28 @@ def _axis(parts: list[Part]) -> _Axis:
 def _shapes(frequency: Array, edges: NDArray[np.int_], longest: int) -> Array:
     """Power (K, B) of noise of variance one, of every colour, in bands that begin at `edges`."""
     ends = np.append(edges[1:], len(frequency))
-    each = []
-    for memory in np.geomspace(1.0, longest, MEMORIES):
-        a = np.exp(-1 / memory)
-        powers = [(1 - a**2) / (1 - 2 * a * np.cos(2 * np.pi * frequency) + a**2)]
-        if memory < SMOOTH * longest:
-            powers.append(powers[0] ** 2 * (1 - a**2) / (1 + a**2))
-        each += [np.add.reduceat(power, edges) / (ends - edges) for power in powers]
+    once = [_forgotten(frequency, a) for a in np.geomspace(1.0, longest, MEMORIES)]
+    smooth = np.geomspace(1.0, max(SMOOTH * longest, 1.0), FINER * MEMORIES)
+    each = [np.add.reduceat(p, edges) / (ends - edges)
+            for p in (*once, *(_forgotten(frequency, m, twice=True) for m in smooth))]  # fmt: skip
     found = [share * one + 1 - share for one in each for share in SHARES]
     return np.array(found)
 
 
-def _likely(shapes: Array, told: Array, squares: Array) -> tuple[Array, Array]:
-    """How likely each colour is (K,), and the variance (K,) of the noise that it is then."""
+def _forgotten(frequency: Array, memory: float, *, twice: bool = False) -> Array:
+    """Power (N,) of noise of variance one that is forgotten as exp(−k/memory), or averaged `twice`
+    so."""
+    a = np.exp(-1 / memory)
+    power = (1 - a**2) / (1 - 2 * a * np.cos(2 * np.pi * frequency) + a**2)
+    return power**2 * (1 - a**2) / (1 + a**2) if twice else power
+
+
+def _likely(shapes: Array, told: Array, squares: Array, before: Array) -> tuple[Array, Array]:
+    """How likely each colour is (K,), as it was `before` (K,), and the variance (K,) of the noise
+    that it is then."""
     sizes = np.maximum((1 / shapes) @ squares / told.sum(), 1e-300)
     chance = -0.5 * (told.sum() * np.log(sizes) + np.log(shapes) @ told)
-    weight = np.exp(chance - chance.max())
+    weight = before * np.exp(chance - chance.max())
     return weight / weight.sum(), sizes
 
 

@@ -47,18 +47,20 @@ def certified(sensor: Sensor, state: State[Fit], before: Estimate) -> tuple[Stat
         state = state.refusing(last.what, why)
         if ANOTHER in why:
             state = replace(state, gone=state.gone | {last.what.label})
-        instead = None if why == NO_SIZE else _replaced(sensor, state, last)
+        instead = _replaced(sensor, state, last)
         if instead is not None:
             state = instead
             continue
         fit = sensor.without(state.fit, last.what)
         if fit is None:
             return state, before
-        # What it leaves, it explains again: what has a name, under that name.
+        # What it leaves, it explains again: what has a name, under that name, and its rivals.
+        beside = ranked(sensor, fit)
+        others = {rival.what.label for rival in last.rivals}
+        rivals = (e for e in beside.found if others.issuperset(e.families))
         nameless = ANOTHER in why or last.what.label == FORMULA
-        open_ = state.open if nameless else (last.evidence, *state.open)
-        state = replace(left_in(state, fit), open=open_)
-        state = replace(state, last=ranked(sensor, fit))
+        own = (*rivals,) if nameless else (last.evidence, *rivals)
+        state = replace(left_in(state, fit), open=(*own, *state.open), last=beside)
 
 
 def left_in(state: State[Fit], fit: Fit) -> State[Fit]:
