@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -36,8 +37,9 @@ def foretelling(
         less = sensor.without(state.fit, state.kept[-1].what)
         if less is None or _better(*on_the_same_samples(*hidden)):
             break
-        last = state.kept[-1].what
-        state = left_in(state, less).refusing(last, NOT_HELD_OUT)
+        last = state.kept[-1]
+        state = replace(left_in(state, less), open=(last.evidence, *state.open))
+        state = state.refusing(last.what, NOT_HELD_OUT)
         state, after = certified(sensor, state, before)
         hidden[1] = held_out(sensor, state.fit, folds)
     return state, after, hidden
