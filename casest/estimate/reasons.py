@@ -21,8 +21,9 @@ SAME = 1e-2
 #: Rise of the cost, in variances, up to which another solution fits alike: half of χ²(1) at 95 %;
 #: and how many standard deviations away it is one of its own.
 ALIKE, APART = 1.92, 10.0
-#: Rise of the cost two standard deviations from the optimum, over what the intervals assume.
-SHAPE = (0.5, 10.0)
+#: Rise of the cost two standard deviations from the optimum, over what the intervals assume; from
+#: FAR on the number says no more.
+SHAPE, FAR = (0.5, 10.0), 1000.0
 #: Within this the linear intervals are as good as those of the likelihood, which are dearer.
 LINEAR = (0.7, 2.0)
 #: From this ratio on a valley is too bent to be looked along: about 45 standard deviations aside.
@@ -200,6 +201,7 @@ def misshapen(low: float, high: float, where: str = "") -> str:
             "vary the motion"
         )
     rise = f"{low:.2g}" + (f" to {high:.2g}" if high > low else "")
+    rise = rise if high < FAR else f"over {FAR:.0f}"
     flat = ": the data hardly determine it" if low < SHAPE[0] else ""
     return (
         f"too uncertain for its intervals: two standard deviations away{place} the cost rises "

@@ -17,6 +17,8 @@ from casest.leastsquares.problem import Point, Problem
 
 #: Inputs for which the catalogue says how much a response bends: of an accelerometer, in m/s².
 EARTH = 9.80665
+#: What is as wide as a part of the range, too.
+WIDTHS = ("threshold", "band")
 
 
 def typical_sizes(
@@ -42,7 +44,10 @@ def typical_sizes(
         own = p.name.rpartition(".")[2]
         if own not in typical:
             return None
-        size = typical[own] * _of_range(effect, units.get(own, ""), largest.get(effect.on, 0.0))
+        range_ = largest.get(effect.on, 0.0)
+        size = typical[own] * _of_range(effect, units.get(own, ""), range_)
+        if dict(effect.profile).get(own) in WIDTHS and range_ > 0:
+            size *= range_ / EARTH
         found.append(np.full(p.shape.coordinates, size))
     return np.concatenate(found)
 
