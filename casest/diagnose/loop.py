@@ -15,7 +15,7 @@ from casest.declaration.symbols import Constant
 from casest.diagnose.candidates.candidates import Candidate, Skipped
 from casest.diagnose.closing import Closing
 from casest.diagnose.cross_validation import Folds, cross_fitted, determined, folded
-from casest.diagnose.evidence.score import Trial
+from casest.diagnose.evidence.score import Evidence, Trial
 from casest.diagnose.found import HELD_OUT_DATA, Found, Undecided
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.misfit.left import refused_for
@@ -310,7 +310,7 @@ def _undecided(sensor: Sensor, state: State[Fit]) -> Undecided | None:
     if not state.open:
         return None
     # Of a pair each explains something beside the other: neither does alone what both do.
-    alone = [e for e in state.open if len(e.trials) == 1] or state.open[:1]
+    alone = [e for e in state.open if len(e.trials) == 1] or _first_of(sensor, state)
     there = {k.what.label for k in state.kept}
     unlike = {r.what.label for r in state.refused if r.another}
     shares = dict[tuple[str, ...], float]()
@@ -337,6 +337,13 @@ def _undecided(sensor: Sensor, state: State[Fit]) -> Undecided | None:
         if len(r.evidence.families) == 1  # of a pair none moves them alone
     }
     return Undecided(names, next(iter(shares.values())), moves)
+
+
+def _first_of(sensor: Sensor, state: State[Fit]) -> tuple[Evidence, ...]:
+    """The first pair that is open and has a refit; the first of all where none has."""
+    refits = ((e, sensor.refit(state.fit, e.trials)) for e in state.open)
+    there = next((e for e, fit in refits if not isinstance(fit, str)), None)
+    return state.open[:1] if there is None else (there,)
 
 
 def _share(sensor: Sensor, state: State[Fit], trials: Sequence[Trial]) -> float | None:

@@ -105,6 +105,8 @@ class Kept:
 #: the model tells itself.
 ANOTHER = "it is another effect"
 STANDS_IN = "its columns stand in their place"
+#: Follows them where another cause came with it.
+BESIDE = " (beside "
 #: And against what the largest readings in a burst of noise make.
 LOUDER = "noise is louder where it is, and readings there differ from each other by as much"
 
@@ -118,8 +120,8 @@ class Refused:
 
     @property
     def another(self) -> bool:
-        """Is it not what its name says?"""
-        return ANOTHER in self.why or STANDS_IN in self.why
+        """Is it not what its name says? Of a pair nobody knows which of the two is not."""
+        return BESIDE not in self.why and (ANOTHER in self.why or STANDS_IN in self.why)
 
 
 @dataclass(frozen=True)
@@ -175,6 +177,6 @@ class State(Generic[F]):
         state = self
         for trial in evidence.trials:
             others = [f for f in evidence.families if f != trial.family]
-            beside = f" (beside {', '.join(others)})" if others else ""
+            beside = f"{BESIDE}{', '.join(others)})" if others else ""
             state = state.refusing(trial.what, why + beside)
         return state
