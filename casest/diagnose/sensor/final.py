@@ -132,9 +132,10 @@ def chance_of_sizes(label: str, after: Estimate) -> float:
 def _sizes(attached: Attached) -> set[str]:
     """Parameters of an effect that are none where it is none: those that are searched over a grid
     only where there are no others (a lag)."""
-    searched = dict(attached.effect.profile)
-    every = {p.name: p.name.rpartition(".")[2] in searched for p in attached.parameters}
-    return {name for name, grid in every.items() if not grid} or set(every)
+    searched, null = dict(attached.effect.profile), attached.effect.null_of
+    own = {p.name: p.name.rpartition(".")[2] for p in attached.parameters}
+    sizes = {name for name, word in own.items() if word not in searched}
+    return sizes or {name for name, word in own.items() if null(word) == 0}
 
 
 def _places(names: set[str], after: Estimate) -> Index:
@@ -144,7 +145,9 @@ def _places(names: set[str], after: Estimate) -> Index:
 
 
 def _by_chance(values: Array, covariance: Array, freedom: float) -> float:
-    """The chance of values (k,) that far from none, by their F test."""
+    """The chance of values (k,) that far from none, by their F test; 0 of what is exact."""
+    if not np.diag(covariance).any() and values.any():
+        return 0.0
     F = float(values @ np.linalg.lstsq(covariance, values, rcond=1e-12)[0]) / len(values)
     return float(fdtrc(len(values), max(freedom, 1.0), max(F, 0.0)))
 
