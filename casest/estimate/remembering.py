@@ -119,7 +119,7 @@ def _forgotten(frequency: Array, memory: float, *, twice: bool = False) -> Array
     so."""
     a = np.exp(-1 / memory)
     power = (1 - a**2) / (1 - 2 * a * np.cos(2 * np.pi * frequency) + a**2)
-    return power**2 * (1 - a**2) / (1 + a**2) if twice else power
+    return np.asarray(power**2 * (1 - a**2) / (1 + a**2) if twice else power)
 
 
 def _likely(shapes: Array, told: Array, squares: Array, before: Array) -> tuple[Array, Array]:
