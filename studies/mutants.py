@@ -101,7 +101,7 @@ MUTANTS = tuple(
         (REASONS, "SLOPE = 1e-5", "SLOPE = 1e-2"),
         (REASONS, "STEP = 1e-4", "STEP = 1.0"),
         (REASONS, "PRACTICALLY_NULL = 1e-5", "PRACTICALLY_NULL = 1e-9"),
-        (REASONS, "SHAPE = (0.5, 10.0)", "SHAPE = (0.05, 100.0)"),
+        (REASONS, "SHAPE, FAR = (0.5, 10.0), 1000.0", "SHAPE, FAR = (0.05, 100.0), 1000.0"),
         (REASONS, "SECOND_ORDER = 0.07", "SECOND_ORDER = 0.7"),
         (REASONS, "CURVATURE = 1e-9", "CURVATURE = -1e9"),
         (REASONS, "ALIKE, APART = 1.92, 10.0", "ALIKE, APART = 0.0192, 10.0"),
