@@ -7,6 +7,7 @@ rate of its own. Only the row counts in which it is new.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +26,8 @@ SELDOM, MOSTLY = 0.02, 0.6
 #: which one repeats, the rows that repeat all of them in those that repeat one, and how much longer
 #: than usual one of a hundred rows stays: what is slow, or rounded, stays for any time.
 COLUMNS, REPEATS, TOGETHER, LONGER = 3, (0.02, 0.9), 0.95, 2.0
+#: Rows of a passage at least, each another one, that is there twice.
+PASSAGE = 8
 
 
 class Renewed(NamedTuple):
@@ -82,6 +85,24 @@ def whole_rows_again(columns: Iterable[Array]) -> NDArray[np.bool_] | None:
     between = np.diff(np.flatnonzero(~again))
     stays = np.quantile(between, 0.99) > LONGER * np.median(between)
     return None if stays else again
+
+
+def passage_again(rows: Array) -> tuple[tuple[int, int], int]:
+    """Where the longest passage of rows (N, q) that is there twice begins, both times, and of how
+    many rows it is; 0 where there is none."""
+    _, same = np.unique(rows, axis=0, return_inverse=True)
+    seen: dict[int, int] = {}
+    shift = np.zeros(len(rows), int)
+    for k, number in enumerate(np.ravel(same).tolist()):
+        shift[k] = k - seen.get(number, k)
+        seen[number] = k
+    edges = np.flatnonzero(np.diff(shift, prepend=-1, append=-1))
+    found = ((0, 0), 0)
+    for a, b in pairwise(edges.tolist()):
+        others = len(set(np.ravel(same)[a:b].tolist()))
+        if shift[a] and others == b - a >= max(PASSAGE, found[1] + 1):
+            found = ((a - int(shift[a]), a), b - a)
+    return found
 
 
 def _written_again(values: Array, rows: int) -> NDArray[np.bool_]:

@@ -9,6 +9,7 @@ import zlib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -79,21 +80,20 @@ def _checked(name: str, file: str, contents: Contents) -> Table:
 def _told_apart(columns: Sequence[Column]) -> tuple[list[Column], list[str]]:
     """Columns of which each has a name of its own, and what to say of those that had not: nobody
     knows which one is meant by it, so that it stands for none."""
-    many, taken = Counter(column.name for column in columns), {column.name for column in columns}
-    found, notes, number = list[Column](), list[str](), Counter[str]()
+    many = Counter(column.name for column in columns)
+    taken, found, own = set(many), list[Column](), dict[str, list[str]]()
     for column in columns:
-        name = column.name
-        if many[name] > 1:
-            number[name] += 1
-            while (own := f"{name} ({number[name]})") in taken:
-                number[name] += 1
-            column = replace(column, name=own)
+        if many[column.name] > 1:
+            numbered = (f"{column.name} ({k})" for k in count(1))
+            name = next(one for one in numbered if one not in taken)
+            taken.add(name)
+            own.setdefault(column.name, []).append(name)
+            column = replace(column, name=name)
         found.append(column)
-    for name, count in many.items():
-        if count > 1:
-            first, last = f"{name} (1)", f"{name} ({number[name]})"
-            notes.append(f"{count} columns are named '{name}': they are '{first}' to '{last}' here")
-    return found, notes
+    return found, [
+        f"{len(names)} columns are named '{name}': they are '{names[0]}' to '{names[-1]}' here"
+        for name, names in own.items()
+    ]
 
 
 def _contents(path: str | os.PathLike[str]) -> tuple[Path, Contents]:

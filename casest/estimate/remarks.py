@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import pairwise
 
 import numpy as np
 
+from casest.data.renewing import passage_again
 from casest.data.stillness import last_decimal
 from casest.declaration.shapes import Array
 from casest.leastsquares.agreement import between_runs
@@ -19,9 +19,9 @@ from casest.leastsquares.weights import scale_of_readings
 NOTABLE_BIAS = 0.3
 #: Gaussian noise passes six standard deviations once in 10⁹ samples.
 FAR_OUT = 6.0
-#: Rows at least, each another one, that are there once more to their last digit before it is said;
-#: digits by which readings must scatter, so that none of it is chance; rows of a run at most.
-PASSAGE, DIGITS, LONGEST = 8, 10, 20_000
+#: Of rows that are there twice: digits by which readings must scatter, so that none of it is
+#: chance; rows of a run at most.
+DIGITS, LONGEST = 10, 20_000
 #: Probability under agreement below which runs are said to disagree.
 DISAGREE = 1e-3
 
@@ -116,31 +116,13 @@ def _copied(problem: Problem, point: Point) -> Iterator[str]:
         digit = last_decimal(run.signals[measured]) if measured else last_decimal(rows)
         if measured and noise < DIGITS * digit:
             continue
-        before, length = _passage(rows)
+        before, length = passage_again(rows)
         if length:
             a, b = (f"{run.rows[k]} to {run.rows[k + length - 1]}" for k in (before[1], before[0]))
             yield (
                 f"rows {a} of {run.name} are rows {b} again, to the last digit: a copy tells "
                 "nothing, and makes standard deviations too small; leave it out"
             )
-
-
-def _passage(rows: Array) -> tuple[tuple[int, int], int]:
-    """Where the longest passage of rows (N, q) that is there twice begins, both times, and of how
-    many rows it is; 0 where there is none."""
-    _, same = np.unique(rows, axis=0, return_inverse=True)
-    seen: dict[int, int] = {}
-    shift = np.zeros(len(rows), int)
-    for k, number in enumerate(np.ravel(same).tolist()):
-        shift[k] = k - seen.get(number, k)
-        seen[number] = k
-    edges = np.flatnonzero(np.diff(shift, prepend=-1, append=-1))
-    found = ((0, 0), 0)
-    for a, b in pairwise(edges.tolist()):
-        others = len(set(np.ravel(same)[a:b].tolist()))
-        if shift[a] and others == b - a >= max(PASSAGE, found[1] + 1):
-            found = ((a - int(shift[a]), a), b - a)
-    return found
 
 
 def _runs_that_disagree(problem: Problem, point: Point, correlated: float) -> Iterator[str]:
