@@ -119,6 +119,9 @@ def _noises_anew(
     if not added:
         return closing
     before, after = first.before, closing.after
+    # What is printed of them is this fit's: its noises are others, and outliers may have gone.
+    least = [chance_of_sizes(f.candidate.label, after) for f in added]
+    added = [replace(f, p_value=max(f.p_value, p)) for f, p in zip(added, least, strict=True)]
     judged = before.model.having(**noises(after.model))
     hidden = cross_fitted(judged, closing.runs, before.values, closing.folds)
     sides = on_the_same_samples(hidden, closing.after_held_out)
