@@ -106,7 +106,7 @@ def test_an_offset_that_follows_temperature_is_named_and_found(tmp_path):
 @pytest.mark.long
 def test_no_chance_is_less_than_that_of_the_sizes_beside_it(tmp_path):
     """Its noises are found anew with a cause: of a public record p was 6e-9 beside sizes of which
-    the printed deviations say 1e-4 (studies/strangers.md)."""
+    the printed deviations say 2e-4 (studies/strangers.md)."""
     k = 6e-4 * np.array([1, -1, 1])
     result = close(tmp_path, an_imu(np.random.default_rng(5)), 23, k)
     (effect,) = result["effects"]
