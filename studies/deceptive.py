@@ -45,7 +45,7 @@ from casest import Model, Run, attempt  # noqa: E402
 
 TABLE = ROOT / "studies" / "deceptive.md"
 #: Fits of each family, and where their random numbers begin.
-FITS, SEED = 100, 30_000
+FITS, SEED = 100, 90_000
 #: Rows, and standard deviation of the noise beside a signal of about one.
 ROWS, NOISES = (25, 80, 400), (0.02, 0.1, 0.3)
 #: Inputs go from 0 to this.

@@ -183,6 +183,40 @@ def test_a_time_that_is_called_by_its_unit_has_it(tmp_path: Path) -> None:
         assert run.time.tolist() == pytest.approx([0, 0.02, 0.04])
 
 
+@pytest.mark.parametrize(
+    ("head", "rows", "said"),
+    [
+        ("uhr [s],x,y,z", 5, "uhr"),  # a unit of time
+        ("uhr,x,y,z", 100, "uhr"),
+        ("uhr,x,y,z", 5, ""),  # the table of an input, maybe
+        ("warm [degC],x,y,z", 100, ""),
+        ("s,x,y,z,uhr [s]", 100, "uhr"),
+        ("t,x,y,z", 100, ""),
+    ],
+)
+def test_a_column_that_grows_and_is_not_called_the_time_is_pointed_out(tmp_path, head, rows, said):
+    """Steps, pulses and lags are not looked for without a time."""
+    grows = 0.5 * np.arange(rows)
+    table = np.column_stack([grows, np.random.default_rng(0).normal(size=(rows, 3)), 2 * grows])
+    file = tmp_path / "log.csv"
+    width = head.count(",") + 1
+    np.savetxt(file, table[:, :width], delimiter=",", header=head, comments="")
+    (run,) = load_runs(file, (Signal("v", 3, None),), columns={"v": "x,y,z"})
+    told = [note for note in run.notes if "grows from row to row" in note]
+    words = f"{said} grows from row to row: if it is the time, say --columns t={said}"
+    assert told == ([words] if said else [])
+    (run,) = load_runs(file, (Signal("v", 3, None),), columns={"v": "x,y,z"}, rate=10.0)
+    assert not any("grows" in note for note in run.notes)
+
+
+def test_rows_that_are_counted_are_no_time(tmp_path: Path) -> None:
+    file = tmp_path / "log.csv"
+    table = np.column_stack([np.arange(200), np.random.default_rng(0).normal(size=(200, 3))])
+    np.savetxt(file, table, delimiter=",", header="row,x,y,z", comments="")
+    (run,) = load_runs(file, (Signal("v", 3, None),), columns={"v": "x,y,z"})
+    assert not any("grows" in note for note in run.notes)
+
+
 def test_a_suggestion_with_blanks_is_quoted_for_the_shell(tmp_path: Path) -> None:
     text = "Acc. X,Acc. Y,Acc. Z\n1,2,3\n2,3,5\n"
     message = refusal(DataError, tmp_path, text)

@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from casest import close
 from casest.cli import run
+from casest.diagnose.cross_validation import times_worse
 
 
 def warm(path, seed, follows):
@@ -91,3 +92,59 @@ def test_a_thermometer_in_kelvin_bends(bend):
     assert [e.candidate.label for e in found.effects] == ["quadratic"]
     assert found.verdict == "extended"
     assert found.after.rmse == pytest.approx(0.01, rel=0.1)
+
+
+def foretold(rng, rows, level):
+    """Errors of a line through 60 rows on those, and on `rows` others of a noise `level`."""
+    x, there = rng.uniform(-1, 1, 60), rng.uniform(-1, 1, rows)
+    y = 1 + 2 * x + rng.standard_normal(60)
+    line = np.polynomial.Polynomial.fit(x, y, 1)
+    other = 1 + 2 * there + level * rng.standard_normal(rows) - line(there)
+    return [(y - line(x))[:, None]], [other[:, None]]
+
+
+def test_of_records_alike_hardly_one_is_said_to_be_foretold_worse():
+    """An F test at 0.001, and half as large again: of 2000 none but by what a line is not known."""
+    rng = np.random.default_rng(11)
+    for rows in (6, 60, 600):
+        said = [times_worse(*foretold(rng, rows, 1.0), 58, 1.0) for _ in range(2000)]
+        assert sum(s is not None for s in said) <= 6  # binomial at 0.001: one in 500 has more
+    told = [times_worse(*foretold(rng, 60, 3.0), 58, 1.0) for _ in range(200)]
+    assert np.mean([t is not None for t in told]) > 0.99
+    assert np.median([t for t in told if t]) == pytest.approx(3.0, rel=0.1)
+    fitted, other = foretold(rng, 60, 1.0)
+    other[0][7] = 50.0
+    assert times_worse(fitted, other, 58, 1.0) is None  # a spike
+
+
+def test_a_record_with_another_gain_is_named_beside_adequate(tmp_path, capsys):
+    rng, files = np.random.default_rng(3), []
+    for gain in (2.0, 2.0, 2.2):
+        x = rng.uniform(-5, 5, 80)
+        files.append(str(tmp_path / f"{len(files)}.csv"))
+        table = np.column_stack([x, gain * x + 0.1 * rng.standard_normal(80)])
+        np.savetxt(files[-1], table, delimiter=",", header="reference,reading", comments="")
+    first, alike, other = files
+    assert "errors on" not in headline(capsys, first, "--holdout", alike)
+    said = headline(capsys, first, "--holdout", other)
+    assert said.startswith("linear on 0.csv: adequate")
+    assert f"but errors on {other} are " in said.replace("- ", "-")
+    assert float(said.rpartition(" are ")[2].split()[0]) == pytest.approx(5.7, rel=0.25)
+
+
+def test_what_is_asked_for_and_has_no_place_is_said_first_with_the_reason(tmp_path, capsys):
+    """A model without a corrected quantity has no input on which a gain could act."""
+    rng, path, model = np.random.default_rng(4), tmp_path / "rows.csv", tmp_path / "plain.py"
+    model.write_text(
+        "import casest as c\n"
+        "@c.model\n"
+        "def plain(x=c.signal('m'), y=c.signal('m'), *, a=c.param('m'), b=c.param(start=1.0)):\n"
+        "    return c.Residual(measured=y, predicted=c.quantity('shown', a + b * x, 'm'))\n"
+    )
+    x, roll = rng.uniform(-1, 1, (2, 200))
+    table = np.column_stack([x, 1 + 2 * x + 0.01 * rng.standard_normal(200), roll])
+    np.savetxt(path, table, delimiter=",", header="x,y,roll", comments="")
+    assert run(["close", str(model), str(path), "--effects", "channel_gain(roll)"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    refused = said.partition("channel_gain(roll) was not added: ")[2]
+    assert refused.startswith("model plain declares no corrected quantity")

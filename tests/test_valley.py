@@ -291,6 +291,14 @@ def test_a_course_that_is_left_and_a_rare_valley_are_refused_with_both_shares():
     assert "--start" in text
 
 
+def test_a_search_goes_on_beside_a_misfit_unless_most_of_its_starts_end_in_one_valley():
+    """Else a larger one, that is refused nothing either, looks for what is smaller still."""
+    left = Scatter(0.2, 0.8, 1.0, 0.01, (78.0, 40.0))
+    for arrived, enough in ((20, False), (49, False), (50, True)):
+        _, search = a_search(arrived=arrived)
+        assert Evidence(left, search).settled == enough
+
+
 def test_without_neighbours_a_valley_that_was_found_once_is_refused():
     problem, search = a_search(arrived=1)
     text = refusal(None, search, problem)

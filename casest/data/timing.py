@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,7 @@ _CLOCKS = {"millis": "ms", "milliseconds": "ms", "micros": "us", "microseconds":
 _UNITS = ("s", "sec", "ms", "msec", "us", "usec", "ns")
 _PAIR = ["clock", "date"]
 _KINDS = ("both", "date", "clock")
+_SERIES = 100  # rows in which what always grows is hardly a table's input
 _LOOK = 100  # rows that tell what a column of text holds
 _RATE_NAMES = ("fs", "rate", "samplerate", "samplingrate", "samplefrequency", "samplingfrequency")
 
@@ -102,6 +103,31 @@ def kept_as_text(table: Table) -> str | None:
         f"{' and '.join(names)} hold times, kept as text; name the time of the record with "
         f"--columns t={names[0]}"
     )
+
+
+def unnamed(table: Table, taken: Collection[str]) -> str | None:
+    """A note on a column that could be the time, where none is called so; `taken` are signals'.
+
+    It always grows, and has a unit of time; or none at all, in a series, and does not count rows.
+    """
+    names = [name for name in table.columns if name not in taken and increasing(table, name)]
+    timed = [name for name in names if _has_unit_of_time(table.columns[name])]
+    bare = [name for name in names if table.columns[name].unit is None and not _counts(table, name)]
+    likely = next(iter(timed or bare if table.n_rows >= _SERIES else timed), None)
+    if likely is None:
+        return None
+    return f"{likely} grows from row to row: if it is the time, say --columns t={likely}"
+
+
+def _has_unit_of_time(column: Column) -> bool:
+    try:
+        return column.unit is not None and bool(units.conversion(column.unit, "s"))
+    except UnitError:
+        return False
+
+
+def _counts(table: Table, name: str) -> bool:
+    return bool(np.all(np.diff(np.asarray(table.columns[name].values, dtype=np.float64)) == 1))
 
 
 def _is_temperature(column: Column) -> bool:

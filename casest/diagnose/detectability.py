@@ -119,15 +119,20 @@ def beyond_their_ends(closing: Closing) -> Iterator[str]:
 
 def noise_of_inputs_in(closing: Closing) -> Iterator[str]:
     """How much of what is left is noise of the inputs, where that counts."""
-    model = closing.after.model
-    plain = [s.name for s in model.signals if s.kind == "plain" and s.name != "t"]
-    names = [name for name in plain if name not in model.traced.readings]
+    names = inputs_that_may_be_noisy(closing)
     if closing.averaged > LEVELS.most and names:
         said = " or ".join(names)
         yield (
             f"{100 * closing.averaged:.0f} % of what is left goes with how {said} differs from its "
             f"rows before and after: noise of {said}, or readings that were averaged"
         )
+
+
+def inputs_that_may_be_noisy(closing: Closing) -> list[str]:
+    """Names of what is recorded beside the reading, but for the time."""
+    model = closing.after.model
+    plain = [s.name for s in model.signals if s.kind == "plain" and s.name != "t"]
+    return [name for name in plain if name not in model.traced.readings]
 
 
 def _harm(closing: Closing, hidden: Invisible) -> float:

@@ -290,12 +290,10 @@ def _refused(sensor: Sensor, state: State[Fit], declared: Fit) -> tuple[Skipped,
     several = sorted(reversed(state.refused), key=lambda r: not sensor.asked(r.what))
     said = {r.what.label: r.why for r in several if r.what.label not in added}
     asked, skipped = sensor.tried.unseen(declared, _shown(state))
-    hidden = {s.name for s in asked}
-    return (
-        *asked,
-        *(Skipped(name, why) for name, why in said.items() if name not in hidden),
-        *(s for s in skipped if s.name not in said),
-    )
+    absent = [s for s in skipped if s.name not in said]
+    before = {s.name for s in (*asked, *absent)}
+    others = (Skipped(name, why) for name, why in said.items() if name not in before)
+    return (*asked, *absent, *others)
 
 
 def _shown(state: State[Fit]) -> set[str]:

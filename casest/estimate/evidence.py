@@ -32,6 +32,8 @@ EXPLAINED = 0.5
 LITTLE_LEFT = 0.9
 #: Chance, over all valleys seen, of explaining so much by accident.
 ACCIDENT = 1e-3
+#: Share of a search's starts that end in one valley, from which on it is believed beside a misfit.
+MAJORITY = 0.5
 #: Times that a search must have come to one valley from different places.
 AGAIN = 3
 
@@ -67,7 +69,13 @@ class Evidence:
         if self.vouched:
             return True
         little = found is None or found.explained >= LITTLE_LEFT * found.resolved
-        return _against(self, 0) is None and (little or not self.misfit)
+        return _against(self, 0) is None and (self.most or little or not self.misfit)
+
+    @property
+    def most(self) -> bool:
+        """Did most of the starts that were followed end here? What lies elsewhere is then small."""
+        looked = self.search
+        return looked is not None and looked.arrived >= MAJORITY * looked.followed
 
     @property
     def lacking(self) -> bool:
@@ -123,9 +131,8 @@ def _against(evidence: Evidence, agreeing: int) -> str | None:
             "search away from what is stiff"
         )
     advice = "give --start near the solution, bounds, or more rows"
-    most = looked.arrived >= 0.5 * looked.followed
     if found is None:
-        if most or looked.arrived + agreeing >= AGAIN:
+        if evidence.most or looked.arrived + agreeing >= AGAIN:
             return None
         return (
             f"{looked.followed} starts over what the data span ended in {looked.valleys} places, "
@@ -133,7 +140,7 @@ def _against(evidence: Evidence, agreeing: int) -> str | None:
         )
     if evidence.misfit:
         enough = found.explained >= EXPLAINED * max(found.resolved, 0.0)
-        if most or (enough and looked.arrived + agreeing >= AGAIN):
+        if evidence.most or (enough and looked.arrived + agreeing >= AGAIN):
             return None
         return (
             f"it explains {100 * max(found.explained, 0.0):.0f} % of the readings' variance, of "
@@ -141,7 +148,7 @@ def _against(evidence: Evidence, agreeing: int) -> str | None:
             f"search over {looked.places} places found nothing better: a wrong valley, or a wrong "
             f"model; {advice}"
         )
-    if most or _accident(found, looked) < ACCIDENT:
+    if evidence.most or _accident(found, looked) < ACCIDENT:
         return None
     return (
         f"no better than chance: {looked.valleys} valleys were seen, and the best explains "

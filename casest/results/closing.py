@@ -17,10 +17,11 @@ from msgspec.structs import asdict, replace
 from casest.declaration.effect import Attached
 from casest.declaration.shapes import Array
 from casest.diagnose.closing import Closing
-from casest.diagnose.cross_validation import rms
+from casest.diagnose.cross_validation import rms, times_worse
 from casest.diagnose.detectability import (
     beyond_their_ends,
     detectable,
+    inputs_that_may_be_noisy,
     invisible,
     noise_of_inputs_in,
 )
@@ -136,7 +137,8 @@ class WholeRecord(Struct, frozen=True):
 class Closed(Fitted, frozen=True, kw_only=True, dict=True):
     """The content of `result.json` of `close`.
 
-    `holdout`: the files of another record that held-out errors are those of, where one was given.
+    `holdout`: the files of another record that held-out errors are those of, where one was given;
+    `holdout_over_fit`: how many times those of the fit they are, where that is no chance.
     Beside the file: `docs`, what each added effect says of itself; `closing`, what the loop left.
     """
 
@@ -154,6 +156,7 @@ class Closed(Fitted, frozen=True, kw_only=True, dict=True):
     not_tried: list[Explained]
     whole_record: WholeRecord | UnsetType = UNSET
     holdout: list[str] | UnsetType = UNSET
+    holdout_over_fit: float | UnsetType = UNSET
     docs: dict[str, str]
     closing: Closing
 
@@ -186,12 +189,15 @@ def closing_result(
     units: dict[str, str] = shared["units"]
     before, after = held_out or (closing.before_held_out, closing.after_held_out)
     fitted = _section(closing.after, closing, after)
-    shared["noise"] = NoiseModel(**asdict(shared["noise"]), **left.noise)
+    averaged = closing.averaged if inputs_that_may_be_noisy(closing) else 0.0
+    shared["noise"] = NoiseModel(**asdict(shared["noise"]), **left.noise, of_inputs=averaged)
     shared["notes"] += [*beyond_their_ends(closing), *noise_of_inputs_in(closing)]
     if held_out and (once := happened_once(closing.after)):
         shared["notes"].append(f"{', '.join(once)}: {ALONE}")
+    worse = _worse(closing, after) if held_out else None
     return Closed(
         **shared,
+        holdout_over_fit=UNSET if worse is None else worse,
         verdict=closing.verdict,
         before=_section(closing.before, closing, before),
         after=replace(
@@ -251,6 +257,14 @@ def _section(estimate: Estimate, closing: Closing, held_out: Sequence[Array]) ->
         certificate=Certificate(certificate.trusted, list(certificate.reasons)),
         parameters=parameter_table(estimate, unit_table(estimate.model, closing.runs)),
     )
+
+
+def _worse(closing: Closing, foretold: Sequence[Array]) -> float | None:
+    """How many times worse another record is foretold than this one was fitted, if at all."""
+    after = closing.after
+    fitted = _judged_alike(after, closing).told_residuals(after.point)
+    count = sum(int(np.isfinite(r).sum()) for r in fitted)
+    return times_worse(fitted, foretold, count - after.problem.unknowns, after.correlated_over)
 
 
 def _effect(found: Found, closing: Closing) -> Effect:

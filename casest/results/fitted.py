@@ -71,7 +71,11 @@ class Noise(Struct, frozen=True):
 
 
 class NoiseModel(Noise, frozen=True):
-    """The noise after the loop: also its colour, tails and inequality."""
+    """The noise after the loop: also its colour, tails and inequality.
+
+    `of_inputs`: the share that goes with how inputs differ from their rows before and after, as
+    their own noise does, and readings that were averaged; 0 where there is no saying.
+    """
 
     sigma_by_axis: list[float]
     colour: str
@@ -84,6 +88,7 @@ class NoiseModel(Noise, frozen=True):
     quantisation_step: Number
     largest_over_smallest: Number
     unequal_p_value: Number
+    of_inputs: float
 
 
 class Correlation(Struct, frozen=True):

@@ -58,7 +58,9 @@ def sentence(result: Closed) -> str:
             noise += f"; the noise has a colour (alike over {over:.0f} samples)"
         elif _goes_to_and_fro(result.noise):
             noise += f"; the noise has a colour ({_to_and_fro(result.noise)})"
-        return f"adequate: {said}{noise}{untried}"
+        elif result.noise.of_inputs > LEVELS.most:
+            noise += f"; what is left is {_of_inputs(result.noise)}"
+        return f"adequate: {said}{noise}{_worse(result)}{untried}"
     if result.verdict == "extended":
         left = _remaining_noise(result.noise, result.samples)
         missing = f"{_missing(result.effects)}{_elsewhere(result)}"
@@ -72,12 +74,21 @@ def sentence(result: Closed) -> str:
 
 
 def _elsewhere(result: Closed) -> str:
-    """That what was held out, or a record that was given, is foretold worse with what was added."""
+    """That what was held out, or a record that was given, is foretold worse with what was added, or
+    than what was fitted."""
     before, after = result.before.rmse_holdout, result.after.rmse_holdout
     if not result.effects or before is None or after is None or after <= (1 + WORSE) * before:
-        return ""
+        return _worse(result)
     given = "what was held out" if result.holdout is UNSET else ", ".join(result.holdout)
     return f", but {given} is foretold worse with it"
+
+
+def _worse(result: Closed) -> str:
+    """That another record is foretold much worse than this one was fitted."""
+    if result.holdout is UNSET or result.holdout_over_fit is UNSET:
+        return ""
+    times = f"{result.holdout_over_fit:.2g} times"
+    return f"; but errors on {', '.join(result.holdout)} are {times} those of the fit"
 
 
 def _which(left: Unexplained) -> str:
@@ -134,7 +145,14 @@ def _remaining_noise(noise: NoiseModel, samples: Sequence[Samples]) -> str:
         return f"coloured noise (alike over {over:.0f} samples), or a lag"
     if _goes_to_and_fro(noise):
         return f"coloured noise ({_to_and_fro(noise)})"
+    if noise.of_inputs > LEVELS.most:
+        return _of_inputs(noise)
     return "noise" if count >= LEVELS.series else f"noise as far as {count} rows can tell"
+
+
+def _of_inputs(noise: NoiseModel) -> str:
+    said = f"{percent(noise.of_inputs)} of it goes with rows before and after"
+    return f"noise of the inputs, or an average ({said})"
 
 
 def _goes_to_and_fro(noise: NoiseModel) -> bool:

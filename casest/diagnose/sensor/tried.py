@@ -279,10 +279,15 @@ class Tried:
         tried = {name for c in found for name in (c.name, c.label)}
         absent = []
         for name in sorted(self.known - of_noise - tried):
-            reasons = [s.reason for s in skipped if name in (s.name, s.name.partition("(")[0])]
+            reasons = [s.reason for s in skipped if _bare(s.name) == _bare(name)]
             why = reasons[0] if reasons else "the data have no column that it could follow"
             absent.append(Skipped(name, why))
         return silent, absent
+
+
+def _bare(name: str) -> str:
+    """An effect's name without what it follows."""
+    return name.partition("(")[0]
 
 
 def _axes(fit: Fit, candidate: Candidate, count: int) -> Index | None:
