@@ -251,6 +251,7 @@ def swept(rng, sizes, bend=0.0, sweeps=3):
 SIZES = {"one": np.ones(11), "from a hundredth to one": np.geomspace(0.01, 1, 11)}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sizes", SIZES.values(), ids=SIZES)
 def test_repeats_in_several_sweeps_do_not_lack_fit_whatever_their_sizes(sizes):
     rng = np.random.default_rng(3)

@@ -60,6 +60,7 @@ def staircase(seed: int, beyond: float) -> dict[str, np.ndarray]:
     return {"reference": given, "reading": 0.3 + 1.01 * response + rng.normal(0, 0.05, 150)}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_a_gain_that_bends_is_no_saturation(seed):
     """It loses a twentieth of its gain: nothing is cut off, and nothing is compressed."""

@@ -41,6 +41,7 @@ def test_a_command_is_under_no_suspicion_of_noise(tmp_path):
     assert np.median(np.abs(moved)) > 0.1
 
 
+@pytest.mark.long
 def test_what_follows_a_command_slowly_is_found(tmp_path):
     found = close("linear", driven(np.random.default_rng(0), tmp_path / "log.csv"))
     (effect,) = found.effects

@@ -88,6 +88,7 @@ def test_a_piece_may_end_anywhere(count, monkeypatch):
                                   filtered(bias_gravity, run).smoothed)  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["even", "uneven"])
 def test_the_gramian_of_any_window_is_that_of_its_record(kind, monkeypatch):
     monkeypatch.setattr(gramian, "PIECE", 256)
@@ -112,6 +113,7 @@ def peak(work, run, model=bias_gravity):
     return most - left
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("work", [followed, Products.of])
 def test_memory_beyond_the_record_and_the_result_is_constant(work, monkeypatch):
     """A byte for every sixteen that a record of nine numbers in a row has."""

@@ -98,6 +98,7 @@ def generalised(y, X, rho):
     return squares(solve_triangular(L, y, lower=True), solve_triangular(L, X, lower=True))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rho", [0.0, 0.6, 0.9])
 def test_in_a_series_the_gain_is_that_of_generalised_least_squares(rho):
     """Beside noise whose covariance NumPy knows and the likelihood has to estimate, of a cause that
@@ -537,6 +538,7 @@ def test_the_chance_whatever_the_sizes_is_wald_s_with_the_jackknife_s_variance(a
         assert seen == pytest.approx(expected, rel=1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rows", [51, 90])
 @pytest.mark.parametrize("bend", [np.abs, lambda x: x**3], ids=["kink", "cubic"])
 def test_a_sweep_whose_neighbours_go_together_bends_rarely(rows, bend):

@@ -82,6 +82,7 @@ def test_a_bend_is_the_same_wherever_the_input_is_counted_from(tmp_path, capsys,
     assert effect["formula"].startswith(shown)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("bend", [0.003, 0.03, 0.3])
 def test_a_thermometer_in_kelvin_bends(bend):
     """Of 0.3 to 30 % over 270 to 310 K: about zero kelvin the gain would have to pass zero."""

@@ -60,6 +60,7 @@ def test_accelerometer_and_gyroscope_are_found_within_their_uncertainty(seed):
     assert np.abs(z).max() < 4.5
 
 
+@pytest.mark.long
 def test_the_noise_of_every_kind_is_found():
     rng = np.random.default_rng(5)
     record = recorded(waved(rng, rests=60), an_imu(rng), rng)

@@ -55,6 +55,7 @@ def test_a_kink_is_found_and_proved_where_no_threshold_around_fits_better(fits):
     assert kinks >= 1  # one in thirty or so
 
 
+@pytest.mark.long
 def test_intervals_of_thresholds_hold_the_truth(fits):
     inside = []
     for _, found in fits:

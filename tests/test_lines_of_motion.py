@@ -49,6 +49,7 @@ def test_multiples_of_a_wave_are_no_vibration(tmp_path, seed):
     assert "vibration" not in found_in(file)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("frequency", [6.1, 9.4, 40.0])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_vibration_beside_the_motion_is_one(tmp_path, seed, frequency):

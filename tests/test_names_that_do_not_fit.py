@@ -32,6 +32,7 @@ def test_a_smooth_bend_is_no_kink(seed):
     assert found.verdict == "unexplained"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_a_kink_is_one(seed):
     rng, t, u = moved(seed)
@@ -39,6 +40,7 @@ def test_a_kink_is_one(seed):
     assert named(close("linear", {"t": t, "reference": u, "reading": y})) == ["floor"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_a_shift_up_to_a_moment_is_a_step(seed):
     """Whatever else the first row does."""

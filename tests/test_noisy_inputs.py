@@ -59,6 +59,7 @@ def test_a_long_lag_that_averages_noise_is_no_cause(seed):
     assert close("linear", bench(seed, "ramp", 60)).result.verdict == "adequate"
 
 
+@pytest.mark.long
 def test_what_is_more_than_that_noise_is_found():
     drift = 0.001 * np.arange(600)
     closing = close("linear", bench(7, "sine", 600, drift))

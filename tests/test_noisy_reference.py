@@ -35,6 +35,7 @@ def logged(path, rng, reference, response):
     return path
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("seed", "width"),
     [(3, 25), *(pytest.param(*case, marks=LONG) for case in ((0, 12), (1, 6), (2, 6)))],
@@ -66,6 +67,7 @@ def test_a_memory_beside_that_noise_is_found(tmp_path, seed, width):
     assert len(found.effects) == 1
 
 
+@pytest.mark.long
 def test_gains_of_axes_are_no_noise_of_the_reference(tmp_path):
     """In waves of one pitch what each differs by from its neighbours is the wave once more."""
     rng = np.random.default_rng(6)

@@ -89,6 +89,7 @@ def test_a_drift_that_is_there_is_seen_beside_a_wander_as_well():
     assert np.all(beside <= plain + 5)
 
 
+@pytest.mark.long
 def test_white_noise_hardly_ever_pays_for_a_wander():
     """The price is that of one unknown, log N: passed in fewer than one of twenty."""
     paid = 0
@@ -99,6 +100,7 @@ def test_white_noise_hardly_ever_pays_for_a_wander():
     assert paid <= 6
 
 
+@pytest.mark.long
 def test_the_cost_is_that_of_the_whole_covariance(monkeypatch):
     """Beside one spectrum: −2 log of the density, least over the unknowns, by dense matrices."""
     monkeypatch.setattr(wandering, "ROUNDS", 0)

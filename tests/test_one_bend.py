@@ -19,6 +19,7 @@ def skipped(closing):
     return {s.name: s.reason for s in closing.skipped}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_over_inputs_above_zero_a_square_has_one_name(seed):
     rng = np.random.default_rng(seed)
@@ -54,6 +55,7 @@ def test_a_constant_of_the_model_comes_before_an_effect_that_does_the_same():
     assert skipped(closing)["quadratic"] == "does here what cubic does"
 
 
+@pytest.mark.long
 def test_an_angle_of_a_few_degrees_is_no_harmonic():
     """Twice per turn cannot be seen there, and would put the offset anywhere."""
     rng = np.random.default_rng(2)

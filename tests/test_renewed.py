@@ -42,6 +42,7 @@ def test_rows_that_repeat_a_slower_sensor_are_left_out_and_said(tmp_path, every)
     assert f"repeat reference, which is new every {every} rows" in said
 
 
+@pytest.mark.long
 def test_a_lag_beside_a_slower_sensor_is_found_without_its_image(tmp_path):
     """The steps of the repeats are a line at 100/3 Hz, and noise of the input: the lag was refused
     and a vibration added."""

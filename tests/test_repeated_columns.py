@@ -45,6 +45,7 @@ def test_a_second_meter_of_the_reference_explains_nothing(record):
     assert "column is reference once more" in skipped(closing)["meter"]
 
 
+@pytest.mark.long
 def test_a_meter_beside_the_reading_explains_nothing(record):
     """Of two thermometers in one box each tells the other better than the weather station does."""
     rng = np.random.default_rng(6)
@@ -56,6 +57,7 @@ def test_a_meter_beside_the_reading_explains_nothing(record):
     assert closing.after.values["gain"] == pytest.approx(3, abs=0.1)
 
 
+@pytest.mark.long
 def test_a_temperature_that_is_most_of_the_reading_is_found_where_the_load_hardly_moves(record):
     """Then the reading follows it within a part in a thousand, and is not that temperature."""
     still = 0.01 * record["reference"]
@@ -130,6 +132,7 @@ def bent_table(rows=35):
     return x, 100 * np.tanh(2 * x) + rng.normal(0, 1.0, rows), rng
 
 
+@pytest.mark.long
 def test_of_few_rows_a_column_that_goes_with_the_input_is_no_influence():
     """A position on a stage, in proportion to the input but for 15 %: its curve is the bend's."""
     x, y, rng = bent_table()
@@ -139,6 +142,7 @@ def test_of_few_rows_a_column_that_goes_with_the_input_is_no_influence():
     assert not [e for e in closing.effects if e.candidate.column]
 
 
+@pytest.mark.long
 def test_a_column_that_is_named_as_an_uncertainty_is_no_influence():
     x, y, rng = bent_table()
     error = 2 + 0.05 * np.abs(y) + rng.normal(0, 1.5, len(x))
@@ -210,6 +214,7 @@ def test_in_a_motion_of_several_frequencies_the_angle_is_a_column_of_its_own():
     assert lag == pytest.approx(0.007, abs=0.001)
 
 
+@pytest.mark.long
 def test_a_quotient_of_the_reading_and_another_column_explains_nothing(record):
     """A log of a motor holds its torque over its current; the current itself is an influence."""
     rng = np.random.default_rng(7)
@@ -221,6 +226,7 @@ def test_a_quotient_of_the_reading_and_another_column_explains_nothing(record):
     assert skipped(closing)["constant"].startswith("column is made of reading and current")
 
 
+@pytest.mark.long
 def test_a_column_that_is_asked_for_by_name_is_tried_whatever_it_resembles(record):
     """As of the meter in the box above: the user says that it is no meter of the reading."""
     rng = np.random.default_rng(6)

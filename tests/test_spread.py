@@ -217,6 +217,7 @@ def held(declared, noise, n, count=60):
     return np.mean(inside, axis=0), np.sqrt(np.mean(np.square(scores), axis=0))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("spikes", [0.0, 0.01])
 @pytest.mark.parametrize(("n", "memory"), [(200, 50), (1000, 50)])
 def test_a_record_of_few_memories_of_its_noise_says_so(n, memory, spikes):
@@ -226,6 +227,7 @@ def test_a_record_of_few_memories_of_its_noise_says_so(n, memory, spikes):
     assert np.all(inside >= 0.88)  # 1 in 100 below that, of 60
 
 
+@pytest.mark.long
 def test_axes_with_noise_of_their_own_have_the_std_that_each_has_alone():
     """In a long record the likeliest colours of an axis leave others no chance at all, and of an
     unknown of another axis it says nothing: its std was printed as 0."""
@@ -264,6 +266,7 @@ def test_a_table_whose_neighbours_are_alike_has_the_std_of_a_series(rows, time):
     assert np.all(np.mean(inside, axis=0) >= 0.88)
 
 
+@pytest.mark.long
 def test_outliers_take_nothing_from_what_correlation_adds():
     """Huber's variance alone is that of independent residuals, here 1 : 50."""
     inside, scores = held(line.with_effect(OUTLIERS), remembered(50, 0.6, 0.01), 4000)

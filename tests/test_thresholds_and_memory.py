@@ -115,12 +115,14 @@ def test_a_lag_is_no_low_pass_because_that_smooths_the_reference(seed, lag):
     assert values(closing)["signal_lag(reference).delay"] == pytest.approx(lag, abs=0.01)
 
 
+@pytest.mark.long
 def test_of_a_short_low_pass_behind_noise_the_lag_it_may_be_is_named_with_it():
     closing = close("linear", late(103, tau=0.1))
     (found,) = (e for e in closing.effects if e.candidate.label != "outliers")
     assert {found.candidate.label, *found.rivals} >= {"signal_lag(reference)", "low_pass"}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("asked", ["dead_zone", "saturation", "dead_band", "cubic"])
 def test_whatever_is_asked_for_there_is_an_answer(asked):
     """Asked for, some ended as an internal error: arrays were compared."""

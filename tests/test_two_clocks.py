@@ -57,6 +57,7 @@ def test_the_pace_at_which_two_signals_go_together_is_looked_for(tmp_path, noise
     assert lag_of(tmp_path, record(5, 15, noise)) == pytest.approx(0.3, abs=STEP)
 
 
+@pytest.mark.long
 def test_two_signals_that_have_nothing_to_do_with_each_other_have_no_lag(tmp_path):
     found = []
     for seed in range(40):

@@ -57,6 +57,7 @@ def closed(folder, model, columns, *values):
     return json.loads((folder / "out" / "result.json").read_text())
 
 
+@pytest.mark.long
 def test_of_causes_of_which_none_is_added_it_is_said_how_far_each_moves_the_parameters(
     tmp_path, capsys
 ):
