@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import casest as c
 from casest import close
 from casest.diagnose.closing import Closing
 
@@ -50,3 +51,20 @@ def test_a_shift_up_to_a_moment_is_a_step(seed):
     found = close("linear", {"t": t, "reference": u, "reading": y})
     assert "pulse" not in named(found)
     assert "bias_step" in named(found)
+
+
+@c.model
+def at_rest(s=c.signal(3, "nT"), *, level=c.param(3, "nT")):
+    return c.Residual(measured=s, predicted=c.quantity("shown", level, "nT"))
+
+
+@pytest.mark.parametrize("seed", [1, pytest.param(6, marks=pytest.mark.long)])
+def test_what_a_constant_shows_is_bent_by_nothing(seed):
+    """A sensor at rest that warms up and stays warm: its course ends in a corner, no reading does.
+    Beside a parabola over the column a saturation had p = 5e-20 of a measured record."""
+    rng, warm = np.random.default_rng(seed), np.linspace(0, 30, 900)
+    course = 2 * np.minimum(warm, 18 + rng.uniform(-3, 3))
+    level = np.array([8000.0, -18600.0, -31970.0]) + np.outer(course, [1, -1.2, -1])
+    found = close(at_rest, {"s": level + 6 * rng.standard_normal((900, 3)), "warm": warm})
+    assert named(found)[0] == "channel_curve(warm)"
+    assert not {"floor", "saturation", "dead_band", "dead_zone"} & set(named(found))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from casest.diagnose.evidence.score import Evidence
+from casest.diagnose.evidence.score import Evidence, Trial
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol.choosing import with_the_best
 from casest.diagnose.protocol.elimination import eliminated, on_all_axes
@@ -31,7 +31,8 @@ def search(
     for _ in range(LEVELS.rounds):
         # Else what lies on an axis that was nothing before would look like another cause.
         state = on_all_axes(subject, state, needed=True)
-        trials = [t for t in subject.trials(state.fit) if t.family not in barred]
+        trials = _shown_at_first(subject, state)
+        trials = [t for t in trials if t.family not in barred]
         plain = ranked_of(subject.linear(state.fit), trials)
         seen = Round(state.fit, tuple(k.what for k in state.kept), plain)
         state = replace(state, rounds=(*state.rounds, seen))
@@ -51,6 +52,16 @@ def search(
     if len(left.kept) < len(state.kept):
         left = replace(left, last=ranked(subject, left.fit))
     return left
+
+
+def _shown_at_first(subject: Subject[F], state: State[F]) -> list[Trial]:
+    """What could be missing: of what the declared model leaves nothing to see, a cause that was
+    added would be all there is to bend, and shows its own shape."""
+    several = list(subject.trials(state.fit))
+    if state.first is None:
+        return several
+    there = {e.trials[0].family for e in state.first.found}
+    return [t for t in several if t.family in there or subject.asked(t.what)]
 
 
 def _small(subject: Subject[F], before: State[F], state: State[F]) -> bool:
