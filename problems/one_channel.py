@@ -41,13 +41,17 @@ def polynomial(
     quadratic=param("[reading]/[reference]^2"),
     cubic=constant(0.0, "[reading]/[reference]^3"),
     quartic=constant(0.0, "[reading]/[reference]^4"),
+    at=constant(0.0, "[reference]", chosen=True),
 ):
-    """Polynomial: reading = offset + gain·reference + quadratic·reference² + …
+    """Polynomial: reading = offset + gain·x + quadratic·x² + …, x = reference − at.
 
     The second degree; `--free cubic` and `--free quartic` raise it, `--fix offset=0` leaves a term
-    out. Where several references give one reading, the one inside the calibrated range is meant.
+    out. Of references far from zero for their range no power is told from the others: `--set
+    at=MIDDLE` counts from there. Where several references give one reading, the one inside the
+    calibrated range is meant.
     """
-    corrected = x = quantity("corrected", reference, "[reference]")
+    corrected = quantity("corrected", reference, "[reference]")
+    x = corrected - at
     bent = x * (gain + x * (quadratic + x * (cubic + x * quartic)))
     predicted = quantity("predicted", offset + bent, "[reading]")
     return Residual(measured=reading, predicted=predicted, corrected=corrected)
@@ -82,7 +86,7 @@ def pressure(
     nonlinearity=param("1/[pressure]"),
     offset_drift=param("[reading]/K"),
     sensitivity_drift=param("1/K"),
-    reference_temperature=constant(25.0, "degC"),
+    reference_temperature=constant(25.0, "degC", chosen=True),
 ):
     """Bridge with offset, span, bend, and their temperature coefficients.
 
@@ -114,9 +118,11 @@ def coefficients(declared: Model, runs: Sequence[Run]) -> dict[str, Array]:
     """Least squares for those that are unknown, in references from −1 to 1."""
     unknown = [p.name for p in declared.parameters if p.name in POWERS]
     x, y = column(runs, "reference"), column(runs, "reading")
+    held = {constant.name: constant.array for constant in declared.constants}
+    x = x - held.pop("at", 0.0)
     size = float(np.max(np.abs(x))) or 1.0
-    for held in declared.constants:
-        y = y - held.array * x ** POWERS.index(held.name)
+    for name, value in held.items():
+        y = y - value * x ** POWERS.index(name)
     powers = [POWERS.index(name) for name in unknown]
     found = np.linalg.lstsq((x / size)[:, None] ** powers, y)[0] / size ** np.array(powers, float)
     return dict(zip(unknown, found, strict=True))

@@ -96,6 +96,30 @@ def test_a_polynomial_takes_terms_of_higher_degree():
     np.testing.assert_allclose([found.values[n] for n in names], expected, rtol=1e-9)
 
 
+def test_a_reference_far_from_zero_is_counted_from_its_middle(tmp_path, capsys):
+    """Heights by a barometer over a range of 2 hPa, by the standard atmosphere's formula."""
+    rng, path = np.random.default_rng(5), tmp_path / "walk.csv"
+    p = rng.uniform(1013.9, 1015.8, 150)
+    height = 44330.8 * (1 - (p / 1013.25) ** 0.190263)
+    table = np.column_stack([p, height + 0.002 * rng.standard_normal(150)])
+    np.savetxt(path, table, delimiter=",", header="reference [hPa],reading [m]", comments="")
+    assert casest(["calibrate", "polynomial", str(path)]) == 2
+    said = " ".join(capsys.readouterr().out.split())
+    assert "reference is from 1013.9" in said
+    way = said.partition("count it from its middle, ")[2].split(" What")[0].split()[:2]
+    assert way == ["--set", "at=1015"]
+    assert casest(["close", "polynomial", str(path), *way, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    parameters = found["after"]["parameters"]
+    gain = -44330.8 * 0.190263 / 1013.25 * (1015 / 1013.25) ** (0.190263 - 1)
+    bend = gain * (0.190263 - 1) / (2 * 1015)
+    for name, truth in (("gain", gain), ("quadratic", bend)):
+        value, std = (parameters[name][k] for k in ("value", "std"))
+        assert abs(value - truth) < 3.5 * std
+    # Where one counts from is a choice, which cannot be wrong.
+    assert not any(h["name"] == "at" for h in found["invisible"])
+
+
 def test_beta_is_the_data_sheets_between_its_two_temperatures():
     celsius = np.repeat([25.0, 85.0], 4)
     noise = 1 + 1e-6 * np.tile([1, -1, 1, -1], 2)

@@ -268,7 +268,8 @@ class Model:
                 f"{in_words(new.array.shape)} is given"
             )
         like = old.like or (old.unit if "[" in old.unit and new.unit != old.unit else "")
-        return replace(new, name=name, frozen=old.frozen, like=like)
+        chosen = new.chosen or old.chosen
+        return replace(new, name=name, frozen=old.frozen, like=like, chosen=chosen)
 
     def _with(self, name: str, symbol: Any) -> Model:
         if name in {s.name for s in self.declared}:

@@ -122,6 +122,8 @@ class Constant:
     frozen: Parameter | None = field(default=None, compare=False)
     #: Of its entries, or of the coordinates of the parameter it was fixed from; None: it is exact.
     uncertainty: Uncertainty | None = None
+    #: Is it a choice, as where something is counted from? Then it cannot be wrong.
+    chosen: bool = False
 
     @property
     def array(self) -> Array:
@@ -237,12 +239,21 @@ def _bounds(shape: Shape, bounds: Any) -> tuple[tuple[float, ...], tuple[float, 
     return tuple(map(float, lower)), tuple(map(float, upper))
 
 
-def constant(value: Any, unit: str = "", *, std: Any = None, freedom: float = np.inf) -> Any:
+def constant(
+    value: Any,
+    unit: str = "",
+    *,
+    std: Any = None,
+    freedom: float = np.inf,
+    chosen: bool = False,
+) -> Any:
     """Declare a plain number (or array) of the model with its unit: `constant(0.28, "m")`.
 
     `std` is its standard uncertainty in the same unit, one number or one for each entry:
     `constant(0.28, "m", std=0.001)`. It is carried into every estimate. `freedom`: degrees of
-    freedom of that standard uncertainty, where it is an estimate itself (JCGM 100, G.4).
+    freedom of that standard uncertainty, where it is an estimate itself (JCGM 100, G.4). `chosen`:
+    it is a choice, as the temperature from which another one is counted, and no error of it is
+    looked for.
     """
     if std is None and np.isfinite(freedom):
         raise DeclarationError(f"freedom {freedom!r} is that of a std, and there is none: give std")
@@ -250,7 +261,8 @@ def constant(value: Any, unit: str = "", *, std: Any = None, freedom: float = np
     if not np.all(np.isfinite(array)):
         raise DeclarationError(f"constant {value!r} is not finite")
     known = None if std is None else stated(std, array.shape, freedom)
-    return Constant("", tuple(map(float, array.ravel())), unit, array.shape, uncertainty=known)
+    return Constant("", tuple(map(float, array.ravel())), unit, array.shape, uncertainty=known,
+                    chosen=chosen)  # fmt: skip
 
 
 def named(declaration: Any, name: str) -> Any:

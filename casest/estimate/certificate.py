@@ -30,6 +30,7 @@ from casest.estimate.reasons import (
     BENT,
     BEYOND,
     CURVATURE,
+    FAR,
     LINEAR,
     NOTHING,
     PRACTICALLY_NULL,
@@ -117,7 +118,8 @@ def certify(
     # What cannot be told from rounding is no slope, however small the residual.
     exact = float(np.linalg.norm(factor[1])) <= 10 * rounding * np.sqrt(problem.residual_count)
     amplified = growth(problem, best.point) if np.isfinite(best.cost) else 1.0
-    against += _undetermined(identified, PRACTICALLY_NULL / max(amplified / UNSTABLE, 1.0))
+    least = PRACTICALLY_NULL / max(amplified / UNSTABLE, 1.0)
+    against += _undetermined(problem, identified, least)
     far = BEYOND * np.sqrt(correlated_over)
     if not against:
         wrong = [b for b in at_bound if b.open or not b.beyond <= far]
@@ -192,7 +194,9 @@ def _intervals(shape: tuple[float, float], profiled: bool) -> str:
     return words.cautious_intervals(shape[1]) if wide else words.intervals(*shape)
 
 
-def _undetermined(identified: Identifiability, least: float) -> list[tuple[Code, str]]:
+def _undetermined(
+    problem: Problem, identified: Identifiability, least: float
+) -> list[tuple[Code, str]]:
     """Null directions, or else one that is so for all practical purposes.
 
     What equations amplify tells each unknown alone the better, and no less of them together.
@@ -201,8 +205,25 @@ def _undetermined(identified: Identifiability, least: float) -> list[tuple[Code,
     if identified.unknowns - identified.rank:
         return [(Code.NOT_DETERMINED, words.not_determined(w)) for w in identified.unobservable]
     if singular[-1] < least * singular[0]:
-        return [(Code.NOT_DETERMINED, words.practically_not_determined(identified.weakest))]
+        weakest, way = identified.weakest, _counted_elsewhere(problem)
+        return [(Code.NOT_DETERMINED, words.practically_not_determined(weakest, way))]
     return []
+
+
+def _counted_elsewhere(problem: Problem) -> str:
+    """The way out where powers of an input far from zero are alike: its zero in the middle."""
+    model = problem.model
+    how = "count it from its middle ({middle})"
+    if any(constant.name == "at" for constant in model.constants):
+        how = "count it from its middle, --set at={middle}"
+    for s in model.signals:
+        if s.size > 1 or s.name == "t" or s.name in model.traced.readings:
+            continue
+        x = np.concatenate([run.signals[s.name].ravel() for run in problem.runs])
+        least, most = float(np.nanmin(x)), float(np.nanmax(x))
+        if most - least < FAR * abs(most + least) / 2:
+            return words.count_from(s.name, least, most, how)
+    return ""
 
 
 def _has_likelihood(problem: Problem) -> bool:

@@ -39,6 +39,8 @@ WALKED = 0.2
 #: stay below this share of it. (A flat ellipsoid through poses in a plane "fits" by that part.)
 SECOND_ORDER = 0.07
 #: Singular values of the column-scaled Jacobian below this leave a direction undetermined for all
+#: Range of an input, in its middle, below which that is far from zero.
+FAR = 0.1
 #: practical purposes: its standard deviation is 10⁵ times that of each parameter alone.
 PRACTICALLY_NULL = 1e-5
 #: Below this one, a direction is named as the cause where a fit does not settle.
@@ -127,9 +129,19 @@ def not_determined(direction: str) -> str:
     return f"not determined: {direction}"
 
 
-def practically_not_determined(direction: str) -> str:
-    """NOT_DETERMINED, by a direction that is not quite null."""
-    return f"practically not determined: {direction}; the motion does not separate them"
+def practically_not_determined(direction: str, way: str = "") -> str:
+    """NOT_DETERMINED, by a direction that is not quite null; `way` out, where there is one."""
+    said = f"practically not determined: {direction}; the motion does not separate them"
+    return said + (f"; {way}" if way else "")
+
+
+def count_from(name: str, least: float, most: float, how: str) -> str:
+    """Of an input far from zero for its range; `how` else its zero is moved."""
+    middle = f"{(least + most) / 2:.4g}"
+    return (
+        f"{name} is from {least:.6g} to {most:.6g}, far from zero for its range: "
+        f"{how.format(middle=middle)}"
+    )
 
 
 def bound(name: str, lower: float, upper: float, beyond: float | None = None) -> str:

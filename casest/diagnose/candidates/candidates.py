@@ -204,7 +204,7 @@ def _may_be_wrong(constant: Constant, model: Model) -> bool:
 
     Of a model that looks from rest to rest no noise, and nothing that brings rows of its own.
     """
-    if constant.dims and constant.array.any():
+    if constant.chosen or (constant.dims and constant.array.any()):
         return False
     if not model.resting:
         return not constant.dims
