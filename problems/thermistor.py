@@ -27,7 +27,7 @@ def thermistor_beta(
     *,
     nominal_resistance=param("ohm", start=1e4, bounds=(0, None)),
     beta=param("K", start=3500.0),
-    nominal_temperature=constant(298.15, "K"),
+    nominal_temperature=constant(298.15, "K", chosen=True),
 ):
     """Thermistor by two numbers: resistance = nominal·exp(β/T − β/T₀), T in K, T₀ = 25 °C."""
     ratio = log(resistance / nominal_resistance)
@@ -43,7 +43,7 @@ def steinhart_hart(
     a=param("1/K", start=1e-3),
     b=param("1/K", start=2.5e-4),
     c=param("1/K", start=1e-7),
-    one_ohm=constant(1.0, "ohm"),
+    one_ohm=constant(1.0, "ohm", chosen=True),
 ):
     """Thermistor by three numbers: 1/T = a + b·ln R + c·(ln R)³, T in K and R in ohm."""
     logarithm = log(resistance / one_ohm)
@@ -77,7 +77,9 @@ def _inverse_and_logarithm(runs: Sequence[Run]) -> tuple[Array, Array]:
 def beta_line(declared: Model, runs: Sequence[Run]) -> dict[str, float]:
     """ln R = (ln R₀ − β/T₀) + β/T, a straight line."""
     inverse, logarithm = _inverse_and_logarithm(runs)
-    beta, level = np.polyfit(inverse - 1 / declared["nominal_temperature"].array, logarithm, 1)
+    nominal = declared["nominal_temperature"]
+    T0 = nominal.array if hasattr(nominal, "array") else nominal.start_value()
+    beta, level = np.polyfit(inverse - 1 / T0, logarithm, 1)
     return {"beta": float(beta), "nominal_resistance": float(np.exp(level))}
 
 

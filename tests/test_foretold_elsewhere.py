@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from casest import close
 from casest.cli import run
-from casest.diagnose.cross_validation import times_worse
+from casest.estimate.held_out import times_larger
 
 
 def warm(path, seed, follows):
@@ -108,14 +108,14 @@ def test_of_records_alike_hardly_one_is_said_to_be_foretold_worse():
     """An F test at 0.001, and half as large again: of 2000 none but by what a line is not known."""
     rng = np.random.default_rng(11)
     for rows in (6, 60, 600):
-        said = [times_worse(*foretold(rng, rows, 1.0), 58, 1.0) for _ in range(2000)]
+        said = [times_larger(*foretold(rng, rows, 1.0), 58, 1.0) for _ in range(2000)]
         assert sum(s is not None for s in said) <= 6  # binomial at 0.001: one in 500 has more
-    told = [times_worse(*foretold(rng, 60, 3.0), 58, 1.0) for _ in range(200)]
+    told = [times_larger(*foretold(rng, 60, 3.0), 58, 1.0) for _ in range(200)]
     assert np.mean([t is not None for t in told]) > 0.99
     assert np.median([t for t in told if t]) == pytest.approx(3.0, rel=0.1)
     fitted, other = foretold(rng, 60, 1.0)
     other[0][7] = 50.0
-    assert times_worse(fitted, other, 58, 1.0) is None  # a spike
+    assert times_larger(fitted, other, 58, 1.0) is None  # a spike
 
 
 def test_a_record_with_another_gain_is_named_beside_adequate(tmp_path, capsys):
@@ -131,6 +131,9 @@ def test_a_record_with_another_gain_is_named_beside_adequate(tmp_path, capsys):
     assert said.startswith("linear on 0.csv: adequate")
     assert f"but errors on {other} are " in said.replace("- ", "-")
     assert float(said.rpartition(" are ")[2].split()[0]) == pytest.approx(5.7, rel=0.25)
+    assert run(["calibrate", "linear", first, "--holdout", other]) == 0
+    said = " ".join(capsys.readouterr().out.split("\n\n")[0].split())
+    assert f"trusted; but errors on {other} are " in said.replace("- ", "-")
 
 
 def test_what_is_asked_for_and_has_no_place_is_said_first_with_the_reason(tmp_path, capsys):

@@ -84,7 +84,7 @@ def calibration(
     """Read, fit, save, print; the exit code says whether the estimate is trusted."""
     from casest.diagnose.misfit.left import doubts, refused_for
     from casest.estimate.calibrate import attempt
-    from casest.estimate.held_out import score
+    from casest.estimate.held_out import foretold
     from casest.report.html.calibration import calibration_page
     from casest.report.text.calibration import calibration_text
     from casest.results.calibration import calibration_result, residual_rows
@@ -99,7 +99,7 @@ def calibration(
     start = dict(given.start(model) for given in options.starts) or None
     progress(f"fitting {model_name}")
     found = attempt(model, runs, start=start, solver=options.solver, seed=options.seed)
-    holdout = score(found, hidden) if hidden else None
+    holdout = foretold(found, hidden) if hidden else None
     progress("asking whether the residual is noise")
     result = calibration_result(
         found,
@@ -107,6 +107,7 @@ def calibration(
         data=data,
         command=command,
         holdout=holdout,
+        apart=options.holdout,
         misfit=doubts(found),
     )
     if options.output:

@@ -146,27 +146,6 @@ def rms(residuals: Sequence[Array]) -> float:
     return float(np.sqrt(np.mean(there**2))) if there.size else float("nan")
 
 
-def times_worse(
-    fitted: Sequence[Array], foretold: Sequence[Array], freedom: float, correlated_over: float
-) -> float | None:
-    """How many times worse another record is foretold than one with so many degrees of `freedom`
-    was fitted; None where chance, a few rows or the unknowns' own errors may be why.
-
-    F of independent residuals, clipped as a fit's are: a spike is no record.
-    """
-    from scipy.special import fdtrc
-
-    own, other = (r[np.isfinite(r)] for r in map(np.concatenate, (fitted, foretold)))
-    sigma = rms([own])
-    if not other.size or not sigma > 0:
-        return None
-    clipped = rms([np.clip(other, -LEVELS.clip * sigma, LEVELS.clip * sigma)]) / sigma
-    F = clipped**2 * freedom / own.size
-    chance = fdtrc(other.size / correlated_over, freedom / correlated_over, F)
-    worse = clipped >= LEVELS.lacks and chance < LEVELS.misfit
-    return rms([other]) / sigma if worse else None
-
-
 def _undetermined(before: Estimate, runs: Sequence[Run], folds: Folds) -> dict[int, str]:
     """Folds of which the rest of a record does not determine what they are held out for, and why.
 

@@ -239,7 +239,9 @@ def _estimate(
         spread = no_less(spread, known)
     covariance = spread.covariance
     bias = second_order_bias(problem, point, noise.sigma, inverse_normal(R, free))
-    relative = float(np.max(np.abs(bias[free]) / np.sqrt(np.diag(covariance)[free]), initial=0.0))
+    with np.errstate(invalid="ignore"):
+        size = np.sqrt(np.diag(covariance))
+    relative = float(np.nanmax(np.abs(bias[free]) / size[free], initial=0.0))
     shift = np.outer(bias, bias) if relative > NOTABLE_BIAS else 0.0
     inputs = propagated(problem, point, free)
     shift = shift if inputs is None else shift + inputs.carried
@@ -255,7 +257,8 @@ def _estimate(
         intervals=intervals,
         correlated_over=correlated,
     )
-    unknown = np.logical_or(identified.touched, ~free)
+    # Below zero: less than its rounding, where unknowns are told apart by the last digits alone.
+    unknown = np.logical_or(identified.touched, ~free) | (np.diag(covariance) < 0)
     covariance[unknown, :] = covariance[:, unknown] = np.nan
     return Estimate(
         problem,

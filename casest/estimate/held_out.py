@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from scipy.special import fdtrc
 
 from casest.data.run import Run
 from casest.data.splits import interleaved_blocks
@@ -18,11 +19,15 @@ from casest.errors import UsageError
 from casest.estimate.estimate import Estimate
 from casest.leastsquares.kinds import whitened
 from casest.leastsquares.problem import Problem
+from casest.leastsquares.stated import UNLIKELY
 from casest.solve.horizon import grown
 from casest.solve.trust_region import trust_region
 
 #: Stretches that a held-out record is cut into; every other one is scored.
 STRETCHES = 40
+#: Errors on another record over those of the fit from which on they are said to be larger; standard
+#: deviations of the fit that one of them counts as at most.
+LARGER, CLIP = 1.5, 3.5
 #: What is said of effects that are not there in a record that is scored.
 ALONE = (
     "happened in the record of the fit; another one is foretold without what passed, and with the "
@@ -30,12 +35,40 @@ ALONE = (
 )
 
 
-def score(found: Estimate, runs: Sequence[Run]) -> float:
-    """Root mean square residual of the estimate on runs that it did not see, residual unit."""
+def foretold(found: Estimate, runs: Sequence[Run]) -> list[Array]:
+    """Residuals (N, m) of the estimate on each of the runs, which it did not see."""
     model = lasting(found)
     halves = [split(run, (model,)) for run in runs]
-    rows = [residuals(model, model.among(found.values), *half) for half in halves]
-    return float(np.sqrt(np.mean(np.concatenate([r.ravel() for r in rows]) ** 2)))
+    return [residuals(model, model.among(found.values), *half) for half in halves]
+
+
+def times_worse(found: Estimate, other: Sequence[Array]) -> float | None:
+    """How many times the errors of a fit those on another record (N, m) are; None where chance, a
+    few rows or the unknowns' own errors may be why."""
+    problem = whitened(found.problem, found.point)
+    own = problem.told_residuals(found.point)
+    freedom = sum(int(np.isfinite(r).sum()) for r in own) - problem.unknowns
+    return times_larger(own, other, freedom, found.correlated_over)
+
+
+def times_larger(
+    fitted: Sequence[Array], other: Sequence[Array], freedom: float, over: float
+) -> float | None:
+    """The same of residuals, those fitted with so many degrees of `freedom`, all alike `over` so
+    many rows: F, clipped as a robust fit's are, since a spike is no record."""
+    own, there = _finite(fitted), _finite(other)
+    sigma = float(np.sqrt(np.mean(own**2))) if own.size else 0.0
+    if not there.size or not sigma > 0:
+        return None
+    clipped = np.sqrt(np.mean(np.clip(there / sigma, -CLIP, CLIP) ** 2))
+    chance = fdtrc(there.size / over, freedom / over, clipped**2 * freedom / own.size)
+    times = float(np.sqrt(np.mean(there**2)) / sigma)
+    return times if clipped >= LARGER and chance < UNLIKELY else None
+
+
+def _finite(residuals: Sequence[Array]) -> Array:
+    every = np.concatenate([r.ravel() for r in residuals])
+    return np.asarray(every[np.isfinite(every)])
 
 
 def happened_once(found: Estimate) -> tuple[str, ...]:

@@ -40,7 +40,7 @@ WALKED = 0.2
 SECOND_ORDER = 0.07
 #: Singular values of the column-scaled Jacobian below this leave a direction undetermined for all
 #: Range of an input, in its middle, below which that is far from zero.
-FAR = 0.1
+FAR = 0.5
 #: practical purposes: its standard deviation is 10⁵ times that of each parameter alone.
 PRACTICALLY_NULL = 1e-5
 #: Below this one, a direction is named as the cause where a fit does not settle.

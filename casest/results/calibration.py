@@ -7,9 +7,14 @@ import io
 from collections.abc import Sequence
 from functools import cached_property
 
+import numpy as np
+from msgspec import UNSET, UnsetType
+
+from casest.declaration.shapes import Array
 from casest.diagnose.misfit.findings import Finding
 from casest.effects.placing import prepared
 from casest.estimate.estimate import Estimate
+from casest.estimate.held_out import times_worse
 from casest.results.file import plain
 from casest.results.fitted import (
     Attachment,
@@ -29,10 +34,12 @@ from casest.results.values import parameter_table
 
 
 class Calibration(Fitted, frozen=True, kw_only=True, dict=True):
-    """The content of `result.json` of `calibrate`."""
+    """The content of `result.json` of `calibrate`; `holdout` as that of `close`."""
 
     estimate: Section
     effects: list[Attachment]
+    holdout: list[str] | UnsetType = UNSET
+    holdout_over_fit: float | UnsetType = UNSET
 
     @property
     def doubtful(self) -> bool:
@@ -62,18 +69,20 @@ def calibration_result(
     model_name: str,
     data: Sequence[str],
     command: str = "",
-    holdout: float | None = None,
+    holdout: Sequence[Array] | None = None,
+    apart: Sequence[str] = (),
     misfit: Sequence[Finding] | None = None,
 ) -> Calibration:
     """What `calibrate` leaves. `verdict` is null: no effect was looked for.
 
-    `misfit` is what speaks against the model, null where nobody asked.
+    `holdout`: residuals (N, m) on records in the files `apart`, which the fit did not see. `misfit`
+    is what speaks against the model, null where nobody asked.
     """
     problem, certificate = estimate.problem, estimate.certificate
     table = unit_table(problem.model, problem.runs)
     fit = Section(
         rmse_fit=float(estimate.rmse),
-        rmse_holdout=plain(holdout),
+        rmse_holdout=None if holdout is None else plain(_rms(holdout)),
         certificate=Certificate(
             certificate.trusted,
             list(certificate.reasons),
@@ -89,10 +98,16 @@ def calibration_result(
         degrees_of_freedom=freedom_of(estimate),
     )
     shared = fitted_content(estimate, model_name, data, command)
+    worse = times_worse(estimate, holdout) if holdout else None
     doubts = None if misfit is None else [Doubt(f.where, plain(f.p_value)) for f in misfit]
     return Calibration(**shared, verdict=None, estimate=fit, invisible=None, unexplained=None,
-                       misfit=doubts,
+                       misfit=doubts, holdout=list(apart) or UNSET,
+                       holdout_over_fit=UNSET if worse is None else worse,
                        effects=[attachment(a) for a in problem.model.effects])  # fmt: skip
+
+
+def _rms(residuals: Sequence[Array]) -> float:
+    return float(np.sqrt(np.mean(np.concatenate([r.ravel() for r in residuals]) ** 2)))
 
 
 def doubt_sentence(result: Calibration) -> str:

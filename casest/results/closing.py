@@ -17,7 +17,7 @@ from msgspec.structs import asdict, replace
 from casest.declaration.effect import Attached
 from casest.declaration.shapes import Array
 from casest.diagnose.closing import Closing
-from casest.diagnose.cross_validation import rms, times_worse
+from casest.diagnose.cross_validation import rms
 from casest.diagnose.detectability import (
     beyond_their_ends,
     detectable,
@@ -29,7 +29,7 @@ from casest.diagnose.formula.terms import source
 from casest.diagnose.found import Found
 from casest.diagnose.levels import LEVELS
 from casest.estimate.estimate import Estimate
-from casest.estimate.held_out import ALONE, happened_once
+from casest.estimate.held_out import ALONE, happened_once, times_worse
 from casest.leastsquares.kinds import noises, whitened
 from casest.leastsquares.problem import Problem
 from casest.results.application import formula_of
@@ -194,7 +194,7 @@ def closing_result(
     shared["notes"] += [*beyond_their_ends(closing), *noise_of_inputs_in(closing)]
     if held_out and (once := happened_once(closing.after)):
         shared["notes"].append(f"{', '.join(once)}: {ALONE}")
-    worse = _worse(closing, after) if held_out else None
+    worse = times_worse(closing.after, after) if held_out else None
     return Closed(
         **shared,
         holdout_over_fit=UNSET if worse is None else worse,
@@ -257,14 +257,6 @@ def _section(estimate: Estimate, closing: Closing, held_out: Sequence[Array]) ->
         certificate=Certificate(certificate.trusted, list(certificate.reasons)),
         parameters=parameter_table(estimate, unit_table(estimate.model, closing.runs)),
     )
-
-
-def _worse(closing: Closing, foretold: Sequence[Array]) -> float | None:
-    """How many times worse another record is foretold than this one was fitted, if at all."""
-    after = closing.after
-    fitted = _judged_alike(after, closing).told_residuals(after.point)
-    count = sum(int(np.isfinite(r).sum()) for r in fitted)
-    return times_worse(fitted, foretold, count - after.problem.unknowns, after.correlated_over)
 
 
 def _effect(found: Found, closing: Closing) -> Effect:

@@ -330,6 +330,13 @@ def fitted_content(
     }
 
 
+def worse_elsewhere(files: Sequence[str] | UnsetType, times: float | UnsetType) -> str:
+    """That another record is foretold much worse than the fitted one, after a verdict."""
+    if files is UNSET or times is UNSET:
+        return ""
+    return f"; but errors on {', '.join(files)} are {times:.2g} times those of the fit"
+
+
 def weak_of(estimate: Estimate) -> list[WeakCombination]:
     """Combinations that are determined, but badly."""
     return [WeakCombination(w.words, w.inflation, plain(w.std)) for w in estimate.weak]

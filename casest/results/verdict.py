@@ -17,7 +17,7 @@ from casest.diagnose.levels import LEVELS
 from casest.effects import CATALOGUE
 from casest.effects.placing import MISSING, UNTIMED
 from casest.results.closing import Closed, Effect, Shifts, Unexplained
-from casest.results.fitted import NoiseModel, Samples
+from casest.results.fitted import NoiseModel, Samples, worse_elsewhere
 from casest.results.result import Parameter
 from casest.results.rounding import percent
 
@@ -60,7 +60,8 @@ def sentence(result: Closed) -> str:
             noise += f"; the noise has a colour ({_to_and_fro(result.noise)})"
         elif result.noise.of_inputs > LEVELS.most:
             noise += f"; what is left is {_of_inputs(result.noise)}"
-        return f"adequate: {said}{noise}{_worse(result)}{untried}"
+        worse = worse_elsewhere(result.holdout, result.holdout_over_fit)
+        return f"adequate: {said}{noise}{worse}{untried}"
     if result.verdict == "extended":
         left = _remaining_noise(result.noise, result.samples)
         missing = f"{_missing(result.effects)}{_elsewhere(result)}"
@@ -78,17 +79,9 @@ def _elsewhere(result: Closed) -> str:
     than what was fitted."""
     before, after = result.before.rmse_holdout, result.after.rmse_holdout
     if not result.effects or before is None or after is None or after <= (1 + WORSE) * before:
-        return _worse(result)
+        return worse_elsewhere(result.holdout, result.holdout_over_fit)
     given = "what was held out" if result.holdout is UNSET else ", ".join(result.holdout)
     return f", but {given} is foretold worse with it"
-
-
-def _worse(result: Closed) -> str:
-    """That another record is foretold much worse than this one was fitted."""
-    if result.holdout is UNSET or result.holdout_over_fit is UNSET:
-        return ""
-    times = f"{result.holdout_over_fit:.2g} times"
-    return f"; but errors on {', '.join(result.holdout)} are {times} those of the fit"
 
 
 def _which(left: Unexplained) -> str:

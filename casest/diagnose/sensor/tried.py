@@ -42,6 +42,8 @@ from casest.errors import CasestError
 
 #: Why what remembers is not tried.
 BEGUN_ANEW = "each pose begins anew: nothing is remembered from the one before"
+#: And why what is asked for is not.
+NO_COLUMN = "the data have no column that it could follow"
 #: Samples of a block up to which it is a pose.
 LONGEST_POSE = 32
 
@@ -88,9 +90,10 @@ class Tried:
     @cached_property
     def _in_order(self) -> tuple[list[Effect], list[Skipped]]:
         """The catalogue without what looks at the rows before, where nothing tells them."""
-        if self._in_time:
+        untimed = any(run.time is None for run in self.rows.runs)
+        if self._in_time and not untimed:
             return list(self.catalogue), []
-        why = UNTIMED if any(run.time is None for run in self.rows.runs) else BEGUN_ANEW
+        why = UNTIMED if untimed else BEGUN_ANEW
         left = {e.name for e in self.catalogue if e.kind in OVER_TIME}
         if why == UNTIMED:
             others = ((e.name, e.otherwise) for e in self.catalogue)
@@ -280,7 +283,10 @@ class Tried:
         absent = []
         for name in sorted(self.known - of_noise - tried):
             reasons = [s.reason for s in skipped if _bare(s.name) == _bare(name)]
-            why = reasons[0] if reasons else "the data have no column that it could follow"
+            column = name.partition("(")[2].removesuffix(")")
+            own = any(s.name == column for s in fit.model.signals)
+            none = f"the model reads {column} itself" if own else NO_COLUMN
+            why = reasons[0] if reasons else none
             absent.append(Skipped(name, why))
         return silent, absent
 

@@ -17,6 +17,7 @@ from casest.report.html.poses import poses_seen
 from casest.report.html.profiles import profile_figures
 from casest.report.html.residuals import convincing, residual_figures
 from casest.results.calibration import Calibration, doubt_sentence
+from casest.results.fitted import worse_elsewhere
 from casest.results.profiles import ProfileOf
 from casest.results.residuals import Residuals
 
@@ -68,7 +69,8 @@ def sentence(result: Calibration) -> str:
     but = ", but the residual is not noise" if result.doubtful else ""
     return (
         f"Trusted{but}: {result.identifiability.unknowns} unknowns determined from {count} "
-        f"{result.kind}, with a residual of {rms} rms."
+        f"{result.kind}, with a residual of {rms} rms"
+        f"{worse_elsewhere(result.holdout, result.holdout_over_fit)}."
     )
 
 

@@ -11,6 +11,7 @@ from casest.data.logs import file_name
 from casest.report.next_command import following
 from casest.report.text.layout import WIDTH, held_lines, item, value_table
 from casest.results.calibration import Calibration, doubt_sentence
+from casest.results.fitted import worse_elsewhere
 
 
 def calibration_text(result: Calibration, output: Path | None) -> str:
@@ -37,6 +38,7 @@ def _head(result: Calibration) -> str:
     verdict = "trusted" if result.trusted else "NOT TRUSTED"
     if result.doubtful:
         verdict += ", but the residual is not noise"
+    verdict += worse_elsewhere(result.holdout, result.holdout_over_fit)
     files, determined = ", ".join(file_name(name) for name in result.data), result.identifiability
     line = (
         f"{result.declared} on {files}: {samples} {result.kind}, "
