@@ -24,8 +24,8 @@ def warm(path, seed, follows):
     return str(path)
 
 
-def headline(capsys, *words):
-    assert run(["close", "linear", *words]) == 0
+def headline(capsys, *words, model="linear"):
+    assert run(["close", model, *words]) == 0
     return " ".join(capsys.readouterr().out.split("\n\n")[0].split())
 
 
@@ -152,3 +152,35 @@ def test_what_is_asked_for_and_has_no_place_is_said_first_with_the_reason(tmp_pa
     said = " ".join(capsys.readouterr().out.split())
     refused = said.partition("channel_gain(roll) was not added: ")[2]
     assert refused.startswith("model plain declares no corrected quantity")
+
+
+def test_what_remembers_is_not_tried_without_a_time_and_the_column_that_may_be_it_is_named(
+    tmp_path, capsys
+):
+    rng, path, t = np.random.default_rng(6), tmp_path / "cell.csv", 0.5 * np.arange(300)
+    load = 5.0 * (np.arange(300) // 60 % 2)
+    crept = np.zeros(300)
+    for k in range(1, 300):
+        crept[k] = crept[k - 1] + (load[k - 1] - crept[k - 1]) * 0.5 / 20
+    table = np.column_stack([t, load, 2 * load + 0.04 * crept + 0.005 * rng.standard_normal(300)])
+    np.savetxt(path, table, delimiter=",", header="zeit [s],load [kg],reading [mV]", comments="")
+    assert run(["close", "load-cell", str(path), "--effects", "creep"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "creep was not added: rows without a time are in no order" in said
+    assert "if it is the time, say --columns t=zeit" in said
+    said = headline(
+        capsys, str(path), "--columns", "t=zeit", "--effects", "creep", model="load-cell"
+    )
+    assert "creep" in said.partition(":")[2].split(";")[0]
+
+
+def test_a_lag_of_the_reference_is_left_in_and_said_where_readings_are_corrected(tmp_path, capsys):
+    rng, t, path = np.random.default_rng(7), 0.05 * np.arange(800), tmp_path / "late.csv"
+    x, late = (np.sin(0.9 * u) + np.sin(0.37 * u + 1) for u in (t, t - 0.3))
+    table = np.column_stack([t, x, 0.2 + 1.1 * late + 0.01 * rng.standard_normal(800)])
+    np.savetxt(path, table, delimiter=",", header="t,reference,reading", comments="")
+    out = tmp_path / "out"
+    assert run(["close", "linear", str(path), "-o", str(out)]) == 0
+    capsys.readouterr()
+    assert run(["apply", str(out), str(path), "-o", str(tmp_path / "corrected.csv")]) == 0
+    assert "signal_lag(reference)" in capsys.readouterr().err

@@ -45,3 +45,13 @@ def test_with_it_bends_are_tried_and_found():
     assert "corrected=…" not in text
     found = [e.candidate.label for e in casest.close(told, record(0.1)).effects]
     assert found == ["cubic"]
+
+
+def test_beside_a_cause_that_was_found_it_is_said_that_bends_were_not_tried():
+    rng, t = np.random.default_rng(5), 0.1 * np.arange(300)
+    x = rng.uniform(-1, 1, 300)
+    y = 0.1 + 1.02 * x + 0.004 * t + 0.01 * rng.standard_normal(300)
+    text = said(casest.close(bare, {"t": t, "x": x, "y": y}))
+    assert "extended: bias_drift" in text
+    assert "; bends were not tried (see below)" in text
+    assert "bends were not" not in said(casest.close(told, {"t": t, "x": x, "y": y}))

@@ -10,7 +10,7 @@ from nist import digits
 
 from casest import Run, UsageError, attempt, calibrate, close, constant
 from casest.cli import run as casest
-from casest.effects import CATALOGUE
+from casest.effects import CATALOGUE, quadratic
 from casest.effects.placing import placed_in
 from casest_problems.one_channel import linear, load_cell, polynomial, pressure
 from casest_problems.thermistor import steinhart_hart, thermistor_beta
@@ -142,6 +142,34 @@ def test_steinhart_hart_follows_a_manufacturers_table_where_beta_does_not():
     run = thermistor(celsius, vishay(celsius))
     assert attempt(steinhart_hart, [run]).rmse < 0.05
     assert attempt(thermistor_beta, [run]).rmse > 0.5
+
+
+def test_a_nominal_temperature_that_is_freed_is_refused_in_words(tmp_path, capsys):
+    """With the nominal resistance it is one number: each moves along the same curve."""
+    celsius, path = np.arange(-10.0, 80, 10), tmp_path / "ntc.csv"
+    table = np.column_stack([celsius, vishay(celsius)])
+    np.savetxt(
+        path, table, delimiter=",", header="temperature [degC],resistance [ohm]", comments=""
+    )
+    words = ["thermistor-beta", str(path)]
+    assert casest(["calibrate", *words, "--free", "nominal_temperature"]) == 2
+    assert "`nominal_temperature` cannot be told apart" in " ".join(capsys.readouterr().out.split())
+    assert casest(["close", *words, "--fix", "nominal_resistance=10000", "--json"]) == 0
+    tried = json.loads(capsys.readouterr().out)["smallest_detectable"]
+    assert not any(d["name"] == "nominal_temperature" for d in tried)  # a choice
+
+
+@pytest.mark.parametrize("seed", [3, 5, 7])
+@pytest.mark.filterwarnings("error")
+def test_the_same_term_twice_never_has_a_standard_deviation_of_zero(seed):
+    """`quadratic` of the polynomial and of the catalogue, by rounding alone: 1013.4 ± 0."""
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(250, 300, 60)
+    y = 1013.25 * (1 - 2.2558e-5 * x) ** 5.2559 + 0.02 * rng.standard_normal(60)
+    twice = polynomial.with_effect(quadratic, on="corrected")
+    found = attempt(twice, [record(x, y, unit="m", own="hPa")])
+    assert not found.certificate.trusted
+    assert all(np.isnan(s) or s > 0 for s in found.std.values())
 
 
 def test_temperatures_in_degrees_that_nobody_stated_are_refused():

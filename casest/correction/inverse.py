@@ -70,11 +70,19 @@ def invertible(model: Model) -> tuple[Model, tuple[str, ...]]:
 
 
 def _looks_elsewhere(model: Model, attached: Attached) -> bool:
-    """Does the correction of one sample need others, for this effect?"""
-    if attached.kind != "time":
+    """Does the correction of one sample need others, for this effect?
+
+    Of a signal that is answered late also where it is what the correction gives: that is late.
+    """
+    name = model.traced.corrected
+    if attached.kind != "time" or name is None:
         return attached.kind == "sequence"
-    cut = trace(model, cut=model.traced.corrected)
-    return attached.on in reached_signals(model, cut, cut.expression)
+    cut = trace(model, cut=name)
+    if attached.on in reached_signals(model, cut, cut.expression):
+        return True
+    given = ca.vec(ca.SX(model.traced.quantities[name].declared))
+    recorded = not reached_parameters(model, model.traced, given)
+    return recorded and set(reached_signals(model, model.traced, given)) == {attached.on}
 
 
 def of_their_time(model: Model) -> tuple[str, ...]:

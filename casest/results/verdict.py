@@ -50,7 +50,7 @@ def sentence(result: Closed) -> str:
         said = f"nothing that {few or 'these data'} can show is missing"
         if not names and not result.smallest_detectable:
             said = f"nothing is found; {len(result.not_tried)} effects do not apply here"
-        elif any(s.reason.endswith(MISSING["input"]) for s in result.not_tried):
+        elif _without_bends(result):
             said = "nothing that was tried is missing; bends were not (see below)"
         noise = f"; {', '.join(names)} belong to the noise" if names else ""
         over = result.noise.correlated_over_samples or 1
@@ -65,13 +65,19 @@ def sentence(result: Closed) -> str:
     if result.verdict == "extended":
         left = _remaining_noise(result.noise, result.samples)
         missing = f"{_missing(result.effects)}{_elsewhere(result)}"
-        return f"extended: {missing}; what is left is {left}{untried}"
+        bends = "; bends were not tried (see below)" if _without_bends(result) else ""
+        return f"extended: {missing}; what is left is {left}{bends}{untried}"
     found = f"beside {', '.join(map(_with_rivals, result.effects))} " if names else ""
     many = ""
     if len(names) >= MANY:
         many = f"; {len(names)} effects together may stand for one that is not among them"
     which = _which(result.unexplained)
     return f"unexplained: {found}a misfit remains{which}{many}{_elsewhere(result)}"
+
+
+def _without_bends(result: Closed) -> bool:
+    """Does the model name no place on which a bend of the input could act?"""
+    return any(s.reason.endswith(MISSING["input"]) for s in result.not_tried)
 
 
 def _elsewhere(result: Closed) -> str:
