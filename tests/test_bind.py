@@ -209,6 +209,16 @@ def test_a_column_that_grows_and_is_not_called_the_time_is_pointed_out(tmp_path,
     assert not any("grows" in note for note in run.notes)
 
 
+def test_two_signals_of_one_column_are_said_to_be(tmp_path: Path) -> None:
+    """A reading that is its own reference: gain 1 ± 1e-21, and trusted."""
+    file = tmp_path / "gauge.csv"
+    file.write_text("soll,ist\n1,1.1\n2,2.3\n4,4.2\n")
+    signals = (Signal("reference", 1, None), Signal("reading", 1, None))
+    for column, notes in (("soll", 1), ("ist", 0)):
+        (run,) = load_runs(file, signals, columns={"reference": "soll", "reading": column})
+        assert sum("reference and reading are one column, soll" in n for n in run.notes) == notes
+
+
 def test_rows_that_are_counted_are_no_time(tmp_path: Path) -> None:
     file = tmp_path / "log.csv"
     table = np.column_stack([np.arange(200), np.random.default_rng(0).normal(size=(200, 3))])

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -272,7 +273,14 @@ def _bind(table: Table, signals: Sequence[Signal], options: Options) -> _Bound:
         numbers(table, column, f"column {name}", f"--columns {name}=…", gaps=True)
     taken = {name for names in found.sources.values() for name in names}
     clock, notes = clock_of(table, signals, options, taken)
-    return replace(found, clock=clock, notes=[*found.notes, *notes])
+    return replace(found, clock=clock, notes=[*found.notes, *_shared(found.sources), *notes])
+
+
+def _shared(sources: Mapping[str, tuple[str, ...]]) -> Iterator[str]:
+    """A note on signals that are the same column: one told by itself is told exactly."""
+    for one, other in combinations(sources, 2):
+        if sources[one] == sources[other]:
+            yield f"{one} and {other} are one column, {' '.join(sources[one])}"
 
 
 def _complete(
