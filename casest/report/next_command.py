@@ -170,8 +170,8 @@ def _after_fit(
         own = [flag for flag in flags if flag != "--noise-law"]  # that is calibrate's
         yield "does the model lack an effect?", typed.keeping("close", own).into(into).lines()
     if unexplained:
-        own = "if you know of an effect, written as docs/add_effect.md says in my_effect.py"
-        words = f"if you know that it is {likely}" if likely else own
+        words = "if you know of an effect, written as docs/add_effect.md says in my_effect.py"
+        words = f"if you know that it is {likely}" if likely else words
         named = typed.keeping("close", flags)
         named = replace(named, options=(*named.options, ("--effects", likely or "my_effect.py")))
         yield words, named.into(Path(output) / "asked" if output else "out").lines()
