@@ -6,12 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from casest import Residual, Run, close, model, param, quantity, signal
+from casest import Residual, Run, attempt, close, model, param, quantity, signal
 from casest.diagnose.cross_validation import folded
 from casest.diagnose.misfit.findings import findings
-from casest.diagnose.misfit.left import Misfit, left_over
+from casest.diagnose.misfit.left import Misfit, doubts, left_over
 from casest.diagnose.misfit.pure_error import pure_error
 from casest.diagnose.noise.noise_model import equal_noise, lag_one, noise_model
 from casest.diagnose.noise.spectral_line import strongest_line
@@ -20,6 +22,7 @@ from casest.effects.placing import prepared
 from casest.estimate.correlation import correlation_time
 from casest.leastsquares.problem import Problem
 from casest.solve.trust_region import trust_region
+from casest_problems.one_channel import linear
 
 
 @model
@@ -159,6 +162,36 @@ def test_a_slow_residual_follows_a_column_where_it_answers_to_its_values(seed, a
     found = judged(run)
     assert found.significant
     assert ("of it follows temp" in found.where) is answers
+
+
+def up_and_down(seed, bend, wide=None):
+    """Doubts of a line over an input that goes slowly up and down (or wanders, `wide` samples) in a
+    running mean of ten, or in AR(1) noise; `bend` of the variance is a square."""
+    rng, n = np.random.default_rng(seed), 2000
+    turns = np.arange(n) / n * rng.uniform(1, 9) + rng.random()
+    x = np.sin(2 * np.pi * turns)
+    if wide is not None:
+        x = gaussian_filter1d(rng.standard_normal(n), wide) * np.sqrt(2 * np.sqrt(np.pi) * wide)
+    mean, auto = (np.ones(10), [1.0]), ([1.0], [1.0, -0.6])
+    e = lfilter(*(mean if seed % 2 else auto), rng.standard_normal(n + 500))[500:]
+    square = x**2 - np.polyval(np.polyfit(x, x**2, 1), x)
+    y = 2 * x + np.sqrt(1 - bend) * e / e.std() + np.sqrt(bend) * square / square.std()
+    signals = {"reference": x[:, None], "reading": y[:, None]}
+    units = {"reference": None, "reading": None}
+    return doubts(attempt(linear, [Run.raw("r", signals, units=units, time=0.01 * np.arange(n))]))
+
+
+def test_noise_with_a_short_memory_does_not_follow_a_slow_input():
+    """Rows near in a slow input are near in time: 4 to 9 of 20 were said to follow it."""
+    said = [bool(up_and_down(seed, 0.0)) for seed in range(40)]
+    assert sum(said) <= 2
+
+
+def test_beside_such_noise_a_bend_is_seen():
+    told = [bool(up_and_down(seed, 0.12, wide=2)) for seed in range(12)]
+    assert sum(told) >= 11
+    told = [bool(up_and_down(seed, 0.25)) for seed in range(12)]
+    assert sum(told) >= 11
 
 
 def test_the_share_of_a_wave_is_the_one_that_it_has():

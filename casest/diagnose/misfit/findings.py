@@ -20,7 +20,12 @@ from casest.diagnose.misfit.few_rows import few_rows
 from casest.diagnose.misfit.noisy_inputs import beside_noise_of_inputs
 from casest.diagnose.misfit.pure_error import pure_error
 from casest.diagnose.misfit.reference import along_reference
-from casest.diagnose.misfit.structure import Structure, more_than_courses_do, structures
+from casest.diagnose.misfit.structure import (
+    Structure,
+    more_than_courses_do,
+    more_than_its_colour_does,
+    structures,
+)
 from casest.diagnose.misfit.variables import variables
 from casest.diagnose.noise.noise_model import step_of
 from casest.diagnose.noise.slow_course import MEMORY, slow_course
@@ -83,7 +88,9 @@ def findings(
     found += _repeats(problem, point, clipped, wanders=wanders)
     course = None if wanders else _slow(problem, point, clipped, sigma)
     slow, over = course or (None, 0)
-    follows, by_chance = _follows(problem, point, clipped, over, in_time=not (slow or wanders))
+    follows, by_chance = _follows(
+        problem, point, clipped, over, correlated_over, in_time=not (slow or wanders)
+    )
     found += follows
     if slow and by_chance and by_chance[0].share > LEVELS.most * slow.share:
         why = f": {by_chance[0].name} goes with it, as slow courses may by chance"
@@ -252,6 +259,7 @@ def _follows(
     point: Point,
     clipped: Sequence[Array],
     over: int,
+    correlated_over: float,
     *,
     in_time: bool,
 ) -> tuple[list[Finding], list[Structure]]:
@@ -274,6 +282,10 @@ def _follows(
     ]
     by_chance.sort(key=lambda s: -s.share)
     found = [s for s in found if s not in by_chance]
+    if correlated_over > 1 and not over:
+        found = [
+            s for s in found if more_than_its_colour_does(clipped, one[s.name], correlated_over)
+        ]
     if found and not table:
         beside = [
             s

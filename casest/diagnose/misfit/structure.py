@@ -31,6 +31,8 @@ NEIGHBOURS = 0.6
 #: Places at most to which a residual with a slow course is moved along the record, and the share
 #: from which on one is told from none.
 PLACES, LEAST_SHARE = 99, 1e-3
+#: Half waves over the ranks of a variable, of which a residual is told to follow it.
+WAVES = 6
 #: Where Imhof's integrand is asked: it is smooth in log u, and nothing at both ends.
 LOGS = np.linspace(-25.0, 15.0, 801)
 #: Share of a row's variance that the fit leaves, at least.
@@ -97,6 +99,36 @@ def more_than_courses_do(
     spread = float(np.std(others, ddof=1)) * float(np.sqrt(1 + 1 / len(others)))
     t = (own - float(np.mean(others))) / max(spread, 1e-9)
     return bool(stdtr(len(others) - 1, -t) < LEVELS.chance)
+
+
+def more_than_its_colour_does(residuals: Sequence[Array], variable: Variable, over: float) -> bool:
+    """Does a residual whose neighbours in time are alike, over so many samples, follow a variable
+    by more than such noise would? Rows that are near in a slow variable are near in time.
+
+    F of WAVES over the variable's ranks, of which each axis is told in innovations: those of an
+    autoregression over twice as many samples, by Yule and Walker.
+    """
+    from scipy.linalg import solve_toeplitz
+    from scipy.signal import lfilter
+    from scipy.special import fdtrc
+    from scipy.stats import rankdata
+
+    r, x = np.concatenate(residuals), np.concatenate(variable.values)
+    x = np.mod(x, 2 * np.pi) if variable.turns else x
+    place = (rankdata(x) - 0.5) / len(x)
+    waves = np.cos(np.pi * place[:, None] * np.arange(1, WAVES + 1))
+    memory = int(min(max(np.ceil(2 * over), 1), len(r) // 10))
+    freedom, chances = len(r) - WAVES - memory, []
+    for own in (r - r.mean(axis=0)).T:
+        kin = np.fft.irfft(np.abs(np.fft.rfft(own, 2 * len(own))) ** 2)[: memory + 1]
+        kin[0] *= 1 + 1e-9
+        back = np.concatenate([[1.0], -solve_toeplitz(kin[:-1], kin[1:])])
+        new, columns = lfilter(back, [1.0], own), lfilter(back, [1.0], waves, axis=0)
+        Q, _ = np.linalg.qr(columns[memory:])
+        taken = float(np.sum((Q.T @ new[memory:]) ** 2))
+        left = float(np.sum(new[memory:] ** 2)) - taken
+        chances.append(float(fdtrc(WAVES, freedom, taken / WAVES / max(left / freedom, 1e-300))))
+    return min(chances) * len(chances) < LEVELS.misfit
 
 
 def _length(x: Array) -> int:
