@@ -15,6 +15,8 @@ from casest.diagnose.cross_validation import folded
 from casest.diagnose.misfit.findings import findings
 from casest.diagnose.misfit.left import Misfit, doubts, left_over
 from casest.diagnose.misfit.pure_error import pure_error
+from casest.diagnose.misfit.structure import more_than_its_colour_does
+from casest.diagnose.misfit.variables import Variable
 from casest.diagnose.noise.noise_model import equal_noise, lag_one, noise_model
 from casest.diagnose.noise.spectral_line import strongest_line
 from casest.diagnose.noise.tails import outlier_share, outliers_p_value, tails
@@ -185,6 +187,16 @@ def test_noise_with_a_short_memory_does_not_follow_a_slow_input():
     """Rows near in a slow input are near in time: 4 to 9 of 20 were said to follow it."""
     said = [bool(up_and_down(seed, 0.0)) for seed in range(40)]
     assert sum(said) <= 2
+
+
+def test_an_axis_without_a_residual_follows_nothing():
+    rng = np.random.default_rng(1)
+    x = np.sin(np.linspace(0, 20, 1000))
+    r = np.column_stack([lfilter([1.0], [1.0, -0.6], rng.standard_normal(1000)), np.zeros(1000)])
+    column = Variable("level", (x,))
+    assert not more_than_its_colour_does([r], column, 4.0)
+    assert not more_than_its_colour_does([0 * r], column, 4.0)
+    assert more_than_its_colour_does([r + x[:, None] ** 2 * [[2, 0]]], column, 4.0)
 
 
 def test_beside_such_noise_a_bend_is_seen():

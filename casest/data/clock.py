@@ -127,9 +127,9 @@ def clock_of(
     chosen = _chosen(table, options)
     names = chosen or timing.find_time(table)
     if not names or set(names) & set(taken):
-        if names or options.rate is not None or timing.rate_in_preamble(table):
-            return Clock(), []
-        note = timing.kept_as_text(table) or timing.unnamed(table, taken)
+        note = timing.kept_as_text(table) if not names else None
+        if not (names or note or options.rate or timing.rate_in_preamble(table)):
+            note = timing.unnamed(table, taken)
         return Clock(), [note] if note else []
     if options.rate is not None:
         listed = " and ".join(names)

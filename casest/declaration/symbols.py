@@ -261,8 +261,8 @@ def constant(
     if not np.all(np.isfinite(array)):
         raise DeclarationError(f"constant {value!r} is not finite")
     known = None if std is None else stated(std, array.shape, freedom)
-    return Constant("", tuple(map(float, array.ravel())), unit, array.shape, uncertainty=known,
-                    chosen=chosen)  # fmt: skip
+    values = tuple(map(float, array.ravel()))
+    return Constant("", values, unit, array.shape, uncertainty=known, chosen=chosen)
 
 
 def named(declaration: Any, name: str) -> Any:

@@ -213,16 +213,14 @@ def _undetermined(
 def _counted_elsewhere(problem: Problem) -> str:
     """The way out where powers of an input far from zero are alike: its zero in the middle."""
     model = problem.model
-    how = "count it from its middle ({middle})"
-    if any(constant.name == "at" for constant in model.constants):
-        how = "count it from its middle, --set at={middle}"
+    settable = any(constant.name == "at" for constant in model.constants)
     for s in model.signals:
         if s.size > 1 or s.name == "t" or s.name in model.traced.readings:
             continue
         x = np.concatenate([run.signals[s.name].ravel() for run in problem.runs])
         least, most = float(np.nanmin(x)), float(np.nanmax(x))
-        if most - least < FAR * abs(most + least) / 2:
-            return words.count_from(s.name, least, most, how)
+        if 0 < most - least < FAR * abs(most + least) / 2:
+            return words.count_from(s.name, least, most, settable=settable)
     return ""
 
 

@@ -38,9 +38,9 @@ WALKED = 0.2
 #: An implicit residual is the noise of the reading to first order only; the second-order part must
 #: stay below this share of it. (A flat ellipsoid through poses in a plane "fits" by that part.)
 SECOND_ORDER = 0.07
-#: Singular values of the column-scaled Jacobian below this leave a direction undetermined for all
 #: Range of an input, in its middle, below which that is far from zero.
 FAR = 0.5
+#: Singular values of the column-scaled Jacobian below this leave a direction undetermined for all
 #: practical purposes: its standard deviation is 10⁵ times that of each parameter alone.
 PRACTICALLY_NULL = 1e-5
 #: Below this one, a direction is named as the cause where a fit does not settle.
@@ -135,12 +135,13 @@ def practically_not_determined(direction: str, way: str = "") -> str:
     return said + (f"; {way}" if way else "")
 
 
-def count_from(name: str, least: float, most: float, how: str) -> str:
-    """Of an input far from zero for its range; `how` else its zero is moved."""
+def count_from(name: str, least: float, most: float, *, settable: bool) -> str:
+    """Of an input far from zero for its range, whose zero is `settable` as `at` or the user's."""
     middle = f"{(least + most) / 2:.4g}"
+    how = f", --set at={middle}" if settable else f" ({middle})"
     return (
         f"{name} is from {least:.6g} to {most:.6g}, far from zero for its range: "
-        f"{how.format(middle=middle)}"
+        f"count it from its middle{how}"
     )
 
 

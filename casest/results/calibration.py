@@ -7,10 +7,10 @@ import io
 from collections.abc import Sequence
 from functools import cached_property
 
-import numpy as np
 from msgspec import UNSET, UnsetType
 
 from casest.declaration.shapes import Array
+from casest.diagnose.cross_validation import rms
 from casest.diagnose.misfit.findings import Finding
 from casest.effects.placing import prepared
 from casest.estimate.estimate import Estimate
@@ -82,7 +82,7 @@ def calibration_result(
     table = unit_table(problem.model, problem.runs)
     fit = Section(
         rmse_fit=float(estimate.rmse),
-        rmse_holdout=None if holdout is None else plain(_rms(holdout)),
+        rmse_holdout=None if holdout is None else plain(rms(holdout)),
         certificate=Certificate(
             certificate.trusted,
             list(certificate.reasons),
@@ -104,10 +104,6 @@ def calibration_result(
                        misfit=doubts, holdout=list(apart) or UNSET,
                        holdout_over_fit=UNSET if worse is None else worse,
                        effects=[attachment(a) for a in problem.model.effects])  # fmt: skip
-
-
-def _rms(residuals: Sequence[Array]) -> float:
-    return float(np.sqrt(np.mean(np.concatenate([r.ravel() for r in residuals]) ** 2)))
 
 
 def doubt_sentence(result: Calibration) -> str:

@@ -113,13 +113,12 @@ def more_than_its_colour_does(residuals: Sequence[Array], variable: Variable, ov
     from scipy.special import fdtrc
     from scipy.stats import rankdata
 
-    r, x = np.concatenate(residuals), np.concatenate(variable.values)
-    x = np.mod(x, 2 * np.pi) if variable.turns else x
-    place = (rankdata(x) - 0.5) / len(x)
+    r = np.concatenate(residuals)
+    place = (rankdata(_within_a_turn(variable)) - 0.5) / len(r)
     waves = np.cos(np.pi * place[:, None] * np.arange(1, WAVES + 1))
     memory = int(min(max(np.ceil(2 * over), 1), len(r) // 10))
     freedom, chances = len(r) - WAVES - memory, []
-    for own in (r - r.mean(axis=0)).T:
+    for own in (r - r.mean(axis=0)).T[np.ptp(r, axis=0) > 0]:
         kin = np.fft.irfft(np.abs(np.fft.rfft(own, 2 * len(own))) ** 2)[: memory + 1]
         kin[0] *= 1 + 1e-9
         back = np.concatenate([[1.0], -solve_toeplitz(kin[:-1], kin[1:])])
@@ -128,7 +127,7 @@ def more_than_its_colour_does(residuals: Sequence[Array], variable: Variable, ov
         taken = float(np.sum((Q.T @ new[memory:]) ** 2))
         left = float(np.sum(new[memory:] ** 2)) - taken
         chances.append(float(fdtrc(WAVES, freedom, taken / WAVES / max(left / freedom, 1e-300))))
-    return min(chances) * len(chances) < LEVELS.misfit
+    return any(chance * len(chances) < LEVELS.misfit for chance in chances)
 
 
 def _length(x: Array) -> int:
@@ -143,10 +142,14 @@ def order_of(variable: Variable) -> Index:
 
     Rows of one value are in no order: in that of the record a slow course would follow it.
     """
-    x = np.concatenate(variable.values)
-    x = np.mod(x, 2 * np.pi) if variable.turns else x
+    x = _within_a_turn(variable)
     by_chance = np.random.default_rng(0).permutation(len(x))
     return by_chance[np.argsort(x[by_chance], kind="stable")]
+
+
+def _within_a_turn(variable: Variable) -> Array:
+    x = np.concatenate(variable.values)
+    return np.asarray(np.mod(x, 2 * np.pi) if variable.turns else x)
 
 
 def _of_means(name: str, r: Array, tried: int) -> Structure | None:

@@ -31,8 +31,7 @@ def search(
     for _ in range(LEVELS.rounds):
         # Else what lies on an axis that was nothing before would look like another cause.
         state = on_all_axes(subject, state, needed=True)
-        trials = _shown_at_first(subject, state)
-        trials = [t for t in trials if t.family not in barred]
+        trials = [t for t in _shown_at_first(subject, state) if t.family not in barred]
         plain = ranked_of(subject.linear(state.fit), trials)
         seen = Round(state.fit, tuple(k.what for k in state.kept), plain)
         state = replace(state, rounds=(*state.rounds, seen))
