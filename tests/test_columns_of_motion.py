@@ -80,3 +80,26 @@ def test_columns_of_motion_are_known_by_unit_or_name(tmp_path, column, motion):
     runs = load_runs([str(path)], model.signals)
     name = column.partition(" ")[0]
     assert columns_of_motion(model, runs) == ({name} if motion else set())
+
+
+@pytest.mark.parametrize(
+    ("names", "alike", "motion"),
+    [
+        ("beschl1 beschl2 beschl3", False, True), ("dreh.x dreh.y dreh.z", False, True),
+        ("kanal0 kanal1 kanal2", False, True), ("temp1 temp2 temp3", True, False),
+        ("motor1 motor2 motor3 motor4", False, False),
+    ],
+)  # fmt: skip
+def test_axes_of_another_sensor_are_known_whatever_it_is_called(tmp_path, names, alike, motion):
+    from casest import load_runs
+    from casest.results.find import find_model
+
+    rng, columns = np.random.default_rng(8), names.split()
+    rows = rng.standard_normal((40, 3 + len(columns)))
+    if alike:
+        rows[:, 3:] = 20 + np.linspace(0, 5, 40)[:, None] + 0.1 * rows[:, 3:]
+    path, model = tmp_path / "r.csv", find_model("norm-diagonal")
+    head = ",".join(["v_x", "v_y", "v_z", *columns])
+    np.savetxt(path, rows, delimiter=",", header=head, comments="")
+    runs = load_runs([str(path)], model.signals)
+    assert columns_of_motion(model, runs) == (set(columns) if motion else set())

@@ -80,6 +80,14 @@ def triads(names: Sequence[str]) -> list[tuple[str, ...]]:
     return []
 
 
+def vectors(names: Sequence[str]) -> list[tuple[str, ...]]:
+    """The same of all axes at once; of four that are counted (motors, cells) none."""
+    by_plain = {plain(name): name for name in names}
+    four = {n for axes in ("0123", "1234") for group in _groups(by_plain, "", axes) for n in group}
+    groups = dict.fromkeys(g for axes in _AXES for g in _groups(by_plain, "", axes))
+    return [group for group in groups if not four.intersection(group)]
+
+
 def _groups(by_plain: dict[str, str], start: str, axes: str) -> list[tuple[str, ...]]:
     found = []
     for name in by_plain:

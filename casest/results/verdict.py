@@ -25,8 +25,12 @@ from casest.results.rounding import percent
 COLOURED = 5
 #: Correlation of neighbours below which errors go to and fro: one tells a tenth of the next.
 TO_AND_FRO = -0.32
-#: The effect whose sign says which of two instruments is slower.
-LOW_PASS = "low_pass"
+#: Effects, each with its parameter, of which a sign says something of the two instruments.
+BELOW_ZERO = {
+    ("low_pass", "tau"): "the reading leads, what it is compared with is the slower one",
+    ("hysteresis", "k"): "the reading leads: what it is compared with has the play, "
+    "or friction adds to what is measured",
+}
 #: Effects from which on, where a misfit remains, they are a description more than causes.
 MANY = 4
 #: Share by which errors of a record that was given are larger than before where that is said.
@@ -251,9 +255,10 @@ def judged(gain: str) -> str:
 
 def sided(effect: Effect) -> Iterator[str]:
     """On which side of two instruments a cause is, where its sign says so."""
-    tau = effect.parameters.get("tau")
-    if effect.name == LOW_PASS and tau is not None and _first_of(tau.value) < 0:
-        yield "tau is below zero: the reading leads, what it is compared with is the slower one"
+    for name, parameter in effect.parameters.items():
+        meaning = BELOW_ZERO.get((effect.name, name))
+        if meaning is not None and _first_of(parameter.value) < 0:
+            yield f"{name} is below zero: {meaning}"
 
 
 def chained(effects: Sequence[Effect]) -> Iterator[str]:

@@ -10,8 +10,12 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
+import numpy as np
+
+from casest.data.matching import vectors
 from casest.data.run import Run
 from casest.declaration.model import Model
+from casest.diagnose.levels import LEVELS
 from casest.units import known, size
 
 #: What inertial sensors and magnetometers measure.
@@ -35,10 +39,29 @@ def columns_of_motion(model: Model, runs: Sequence[Run]) -> frozenset[str]:
     )
     if not moved and not any(s.size == 3 for s in model.signals):
         return frozenset()
-    return frozenset(n for n in run.columns if _is_motion(n, run.column_units.get(n)))
+    named = {n for n in run.columns if _is_motion(n, run.column_units.get(n))}
+    return frozenset(named | _axes_of_a_vector(runs))
+
+
+def _axes_of_a_vector(runs: Sequence[Run]) -> set[str]:
+    """Columns without a unit that are three by their names, and do not go alike: another sensor's
+    axes, whatever it is called. Three thermometers do go alike."""
+    units = runs[0].column_units
+    unknown = [n for n in runs[0].columns if not _says(units.get(n))]
+    found = set[str]()
+    for group in vectors(unknown):
+        columns = [np.concatenate([run.columns[n] for run in runs]) for n in group]
+        with np.errstate(invalid="ignore"):
+            untold = 1 - np.corrcoef(columns) ** 2
+        if np.nanmax(untold, initial=0.0) > LEVELS.stand_in:
+            found.update(group)
+    return found
 
 
 def _is_motion(name: str, unit: str | None) -> bool:
-    if unit and known(unit) and "count" not in unit:
-        return size(unit)[1] in _MEASURED
-    return bool(_CALLED.search(name))
+    return size(unit)[1] in _MEASURED if unit and _says(unit) else bool(_CALLED.search(name))
+
+
+def _says(unit: str | None) -> bool:
+    """Does a unit say what is measured?"""
+    return bool(unit and known(unit) and "count" not in unit)

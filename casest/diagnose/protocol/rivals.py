@@ -63,6 +63,8 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
         strong = score >= LEVELS.strong if linear.series else ranking.says(e)
         if not strong and gain < mine.gain and e.trials[0].family not in most:
             continue
+        if own.family not in most and _another_thing(ranking, mine, e):
+            continue
         its = foretold(linear, [_in_time(ranking, e)], stretches)
         lost = fall_between_causes(linear, its, best)
         # The columns of a grid's value promise little: a refit goes further.
@@ -86,6 +88,14 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
         if _as_well(behind, again, nothing, slow):
             found.append(Rival(e.trials[0].what, fit))
     return state, found
+
+
+def _another_thing(ranking: Ranking, mine: Evidence, other: Evidence) -> bool:
+    """Does a cause keep most of what it explains beside another one, which is none in its place?"""
+    both = judged([*mine.trials, *other.trials], ranking.likelihood, ranking.none,
+                  start=mine.explained, families=ranking.families)  # fmt: skip
+    kept = 0.0 if both is None else both.gain + both.feigned - other.gain - other.feigned
+    return kept > LEVELS.most * (mine.gain + mine.feigned)
 
 
 def _without(subject: Subject[F], state: State[F], kept: Kept) -> tuple[F, Ranking] | None:
