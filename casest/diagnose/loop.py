@@ -22,12 +22,11 @@ from casest.diagnose.misfit.left import refused_for
 from casest.diagnose.noise.slow_course import slow_squares
 from casest.diagnose.protocol import Kept, State, search, with_rivals
 from casest.diagnose.protocol.confirming import falls_of_refit
-from casest.diagnose.protocol.elimination import chance_alone
 from casest.diagnose.protocol.ranking import ranked
 from casest.diagnose.protocol.refits import AS_MUCH
 from casest.diagnose.sensor import Fit, Sensor
 from casest.diagnose.sensor.courses import courses
-from casest.diagnose.sensor.final import certified, chance_of_sizes, left_in
+from casest.diagnose.sensor.final import certified, chance_of_sizes, left_in, printed_chance
 from casest.diagnose.sensor.foretelling import foretelling, on_the_same_samples
 from casest.diagnose.sensor.outliers import spoilt, without_outliers
 from casest.diagnose.sensor.to_both_sides import of_inputs
@@ -274,8 +273,7 @@ def _found(sensor: Sensor, state: State[Fit], kept: Kept, after: Estimate) -> Fo
         for r in kept.rivals
         if r.what.label not in added
     }
-    chance = chance_alone(sensor, state, kept)
-    chance = max(chance, chance_of_sizes(candidate.label, after))
+    chance = printed_chance(sensor, state, kept, after)
     return Found(candidate, chance, fall, names, rivals)
 
 

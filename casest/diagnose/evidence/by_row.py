@@ -42,8 +42,11 @@ def chance_by_row(before: Linear, after: Linear, *, together: bool = False) -> f
     return float(fdtrc(q, rest, F / larger))
 
 
-def chance_together(before: Linear, after: Linear) -> float:
-    """That of the classical F test, with what neighbours that are alike make of the variance."""
+def chance_together(before: Linear, after: Linear, over: float = 1.0) -> float:
+    """That of the classical F test, with what neighbours that are alike make of the variance.
+
+    `over`: rows over which they are known to be alike, where there is a better word for it.
+    """
     from scipy.special import fdtrc
 
     q, rest = _freedom(before, after)
@@ -51,8 +54,9 @@ def chance_together(before: Linear, after: Linear) -> float:
     if rest < 1 or q < 1 or not left > 0:
         return 1.0 if left > 0 else 0.0
     F = max(fall - left, 0.0) / q / (left / rest)
-    larger = _by_neighbours(_beyond(before, after), len(after.residual), kinship(after))
-    return float(fdtrc(q, rest, F / larger))
+    rho = max(kinship(after), (over - 1) / (over + 1))
+    larger = _by_neighbours(_beyond(before, after), len(after.residual), rho)
+    return float(fdtrc(q, max(rest / over, 1.0), F / larger))
 
 
 def _freedom(before: Linear, after: Linear) -> tuple[int, int]:

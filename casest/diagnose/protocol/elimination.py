@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from casest.diagnose.evidence.by_row import chance_by_row
+from casest.diagnose.evidence.by_row import chance_by_row, chance_together
 from casest.diagnose.evidence.input_noise import at_most
 from casest.diagnose.evidence.likelihood import Likelihood
 from casest.diagnose.evidence.linear import alike
@@ -86,6 +86,18 @@ def chance_alone(subject: Subject[F], state: State[F], kept: Kept) -> float:
         return kept.evidence.p_value
     base = subject.without(state.fit, kept.what)
     return kept.evidence.p_value if base is None else _alone(subject, state, kept, base)[1]
+
+
+def chance_in_rows(subject: Subject[F], state: State[F], kept: Kept, over: float) -> float:
+    """p of a cause beside all others in rows that have no time, where the noise is alike `over` so
+    many of them; 0 where it is a series, or has no fit without the cause."""
+    base = subject.without(state.fit, kept.what)
+    linear = subject.linear(state.fit)
+    if base is None or linear.coloured or over <= 1:
+        return 0.0
+    before, after = alike([subject.linear(base), linear])
+    chance = chance_together(before, after, over)
+    return float(min(1.0, chance * np.exp(_alone(subject, state, kept, base)[2])))
 
 
 def on_its_own(subject: Subject[F], state: State[F], kept: Kept) -> tuple[float, float] | None:

@@ -13,9 +13,13 @@ from casest.diagnose.evidence.linear import Index
 from casest.diagnose.formula.search import NAME as FORMULA
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol import Kept, State
-from casest.diagnose.protocol.elimination import on_its_own
+from casest.diagnose.protocol.elimination import (
+    chance_alone,
+    chance_in_rows,
+    on_its_own,
+)
 from casest.diagnose.protocol.ranking import ranked
-from casest.diagnose.protocol.state import ANOTHER
+from casest.diagnose.protocol.state import ANOTHER, Rival
 from casest.diagnose.sensor.fits import Fit
 from casest.diagnose.sensor.sensor import Sensor
 from casest.diagnose.sensor.unlike import another
@@ -47,7 +51,9 @@ def certified(sensor: Sensor, state: State[Fit], before: Estimate) -> tuple[Stat
         state = state.refusing(last.what, why)
         if ANOTHER in why:
             state = replace(state, gone=state.gone | {last.what.label})
-        instead = _replaced(sensor, state, last)
+        # What may be nothing by its own size explains as much all the same.
+        still = (Rival(last.what, state.fit),) if why == NO_SIZE else ()
+        instead = _replaced(sensor, state, last, still)
         if instead is not None:
             state = instead
             continue
@@ -70,17 +76,20 @@ def left_in(state: State[Fit], fit: Fit) -> State[Fit]:
     return replace(state, fit=fit, kept=kept)
 
 
-def _replaced(sensor: Sensor, state: State[Fit], kept: Kept) -> State[Fit] | None:
-    """The state with the first rival of a cause in its place that is not refused at a glance, and
-    has strong evidence of its own."""
+def _replaced(
+    sensor: Sensor, state: State[Fit], kept: Kept, still: tuple[Rival, ...]
+) -> State[Fit] | None:
+    """The state with the first rival of a cause in its place that is not refused, and has strong
+    evidence of its own; `still`: more that are its rivals."""
+    refused = [r.what for r in state.refused]
     for k, rival in enumerate(kept.rivals):
         fit = sensor.replaced(state.fit, kept.what, rival.what, rival.fit)
-        if fit is None or isinstance(sensor.certified(fit), str):
+        if rival.what in refused or fit is None or isinstance(sensor.certified(fit), str):
             continue
-        other = replace(kept, what=rival.what, rivals=kept.rivals[k + 1 :])
+        other = replace(kept, what=rival.what, rivals=(*still, *kept.rivals[k + 1 :]))
         several = tuple(other if one is kept else one for one in state.kept)
-        still = tuple(e for e in state.open if rival.what.label not in e.families)
-        found = replace(state, fit=fit, kept=several, open=still)
+        others = tuple(e for e in state.open if rival.what.label not in e.families)
+        found = replace(state, fit=fit, kept=several, open=others)
         score, chance = on_its_own(sensor, found, other) or (-np.inf, 1.0)
         if score > (LEVELS.strong if sensor.linear(fit).series else 0.0):
             own = replace(other, evidence=replace(other.evidence, p_value=chance))
@@ -95,38 +104,58 @@ def _at_fault(sensor: Sensor, state: State[Fit], after: Estimate) -> tuple[Kept 
         return _least(state, after), f"its fit is refused: {after.certificate.reasons[0]}"
     label, why = another(after.model, after.values, sensor.model)
     if not why:
-        claimed = (a for k in reversed(state.kept) if not sensor.asked(k.what)
-                   for a in after.model.effects if a.label == k.what.label)  # fmt: skip
-        label = next((a.label for a in claimed if _is_nothing(a, after)), "")
+        claimed = [k for k in reversed(state.kept) if not sensor.asked(k.what)]
+        chances = [(_chance_of_nothing(sensor, state, k, after), k.what.label) for k in claimed]
+        chance, label = max(chances, key=lambda c: c[0], default=(0.0, ""))
+        label = label if chance > LEVELS.chance else ""
         why = label and NO_SIZE
     return next((k for k in state.kept if k.what.label == label), None), why
 
 
-def _is_nothing(attached: Attached, after: Estimate) -> bool:
-    """Is each of an effect's sizes within two standard deviations of none, were noise alike
-    everywhere? Then only rows that count less, or a colour of the noise, had spoken for it. Or are
-    all of them together what chance may be, by the standard deviations that are printed? Of a
-    formula each term is one more that was looked for: none may be nothing."""
+def _chance_of_nothing(sensor: Sensor, state: State[Fit], kept: Kept, after: Estimate) -> float:
+    """The chance of a cause as it is printed; one where each of its sizes is within two standard
+    deviations of none, were noise alike everywhere: then only rows that count less, or a colour of
+    the noise, had spoken for it. Of a formula each term is one more that was looked for: none may
+    be nothing."""
+    attached = _attached(kept.what.label, after)
+    if attached is None:
+        return 0.0
     z = [np.abs(after.values[n]) / after.plain[n] for n in _sizes(attached) if n in after.plain]
     if z and all(bool(np.all(one < LEVELS.apart)) for one in z):
-        return True
+        return 1.0
     if attached.effect.name == FORMULA:
         z = [np.abs(after.values[n]) / after.std[n] for n in _sizes(attached)]
         if any(bool(np.any(one < LEVELS.apart)) for one in z):
-            return True
-    return chance_of_sizes(attached.label, after) > LEVELS.chance
+            return 1.0
+    return printed_chance(sensor, state, kept, after)
 
 
 def chance_of_sizes(label: str, after: Estimate) -> float:
     """The chance of an effect's sizes by the standard deviations that are printed of them; 0 of
     one that has none. A likelihood beside slow noise weighs what is quick, they weigh all of it."""
-    attached = next((a for a in after.model.effects if a.label == label), None)
+    attached = _attached(label, after)
     own = _places(_sizes(attached), after) if attached is not None else np.zeros(0, int)
     C = after.covariance[np.ix_(own, own)]
     if not own.size or not np.isfinite(C).all():
         return 0.0
     freedom = float(np.array(after.effective_freedom)[own].min())
     return _by_chance(after.point.x[own], C, freedom)
+
+
+def printed_chance(sensor: Sensor, state: State[Fit], kept: Kept, after: Estimate) -> float:
+    """The chance of a cause beside the others: no less than that of its sizes, or of one that has
+    none, in rows without a time, than what rows that are alike leave of it."""
+    label = kept.what.label
+    attached = _attached(label, after)
+    if attached is None or _sizes(attached):
+        least = chance_of_sizes(label, after)
+    else:
+        least = chance_in_rows(sensor, state, kept, after.correlated_over)
+    return max(least, chance_alone(sensor, state, kept))
+
+
+def _attached(label: str, after: Estimate) -> Attached | None:
+    return next((a for a in after.model.effects if a.label == label), None)
 
 
 def _sizes(attached: Attached) -> set[str]:
