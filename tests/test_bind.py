@@ -508,6 +508,8 @@ def test_readings_beyond_what_can_be_squared_are_refused(
     said = refusal(DataError, tmp_path, text)
     assert words in said
     assert "--scale v" in said
+    said = refusal(DataError, tmp_path, "vx,vy,vz\n1,2,3\n1,2,3\n2,1e200,1\n2,1,1\n")
+    assert "for signal v; it does in row 2: take it out" in said
     one = run_of(tmp_path, "vx,vy,vz,w\n1,1e-310,3,1e300\n2,1,1,2e300\n")
     assert one.signals["v"][0, 1] == 1e-310
     assert "column w left out: it holds numbers too large to compute with" in one.notes

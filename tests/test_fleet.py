@@ -180,7 +180,7 @@ def test_bad_sensors_are_named_and_the_others_have_the_same_bits(tmp_path):
         (20, "twice"): f"sensor S000020 is there twice: row 9 of {bad} and row 20 of {bad}; "
         "keep one",
         (11, "readings"): "column vx reaches 1e+200, too large to compute with for signal v; "
-        "choose another column, or scale it: --scale vx=*1e-100",
+        "it does in row 0: take it out, or choose another column",
         (13, "readings"): "it has no readings",
     }
     good = {r["sensor"]: r for r in fleets.results(tmp_path / "clean").to_pylist()}

@@ -110,3 +110,16 @@ def test_no_chance_is_smaller_than_the_interval_beside_it_says():
         name = f"{effect.candidate.label}.k"
         z = abs(found.after.values[name]) / found.after.std[name]
         assert effect.p_value >= 2 * norm.sf(z)
+
+
+@pytest.mark.parametrize("seed", [2, *(pytest.param(s, marks=pytest.mark.long) for s in (0, 5))])
+def test_what_takes_none_of_a_line_away_is_no_rival_of_it(seed):
+    """A stretch sensor that is ahead, beside a line of 39 Hz: the lead explains more, and was
+    called the line's rival."""
+    rng, t = np.random.default_rng([31, seed]), 0.004 * np.arange(1400)
+    x = np.round(45 + 40 * np.sin(2.1 * t) + 15 * np.sin(5.3 * t + 1), 1)
+    y = 400 + 1.6 * x + 0.09 * np.gradient(x, t) + 6 * smooth(rng, 1400, 60)
+    y += 1.6 * np.sin(243 * t + 0.3) + 0.6 * rng.standard_normal(1400)
+    found = close(linear, {"t": t, "reference": x, "reading": y})
+    (line,) = [e for e in found.effects if e.candidate.label == "vibration"]
+    assert line.indistinguishable_from == ()

@@ -54,9 +54,14 @@ def refuse_too_large(file: str, purpose: str, column: str, values: Array) -> Non
     """Raise DataError where the squares of a column leave the range of numbers; NaN is none."""
     largest = _largest(values)
     if largest > MOST:
+        rows = np.flatnonzero(np.abs(values) > MOST)
+        out = f"choose another column, or scale it: --scale {column}=*1e-100"
+        if 2 * len(rows) < len(values):
+            more = f" (and {len(rows) - 1} more such rows)" if len(rows) > 1 else ""
+            out = f"it does in row {rows[0]}{more}: take it out, or choose another column"
         raise DataError(
             f"{file}: column {column} reaches {largest:.3g}, too large to compute with for "
-            f"{purpose}; choose another column, or scale it: --scale {column}=*1e-100"
+            f"{purpose}; {out}"
         )
 
 
