@@ -15,6 +15,7 @@ from casest.declaration.shapes import Array
 from casest.declaration.symbols import Parameter
 from casest.diagnose.candidates.candidates import Candidate
 from casest.diagnose.evidence.linear import Index, Linear
+from casest.diagnose.levels import LEVELS
 
 #: Values on each grid: moments beside the best one, edges of pulses, levels, time constants, lines.
 MOMENTS, EDGES, PULSES, LEVELS_TRIED, CONSTANTS, LINES = 15, 60, 10, 24, 8, 3
@@ -28,8 +29,9 @@ SHORTEST = 3.0
 FROM_NOTHING = {"memory", "threshold", "band"}
 #: Share of a shift's squares that the unknowns may leave and it still counts as seen.
 UNSEEN = 1e-3
-#: Share of the readings that the lowest level lets through, and fewest beyond the highest.
-LOWEST, FEWEST = 0.7, 6
+#: Share of the readings that the lowest level lets through, and fewest beyond the highest; in a
+#: table, where one input alone beyond it is none.
+LOWEST, FEWEST, FEWEST_OF_FEW = 0.7, 6, 2
 #: Share of the readings that the widest threshold holds back, and that the highest floor does.
 BELOW, CUT = 0.6, 0.5
 
@@ -126,13 +128,14 @@ def _levels(seen: Seen) -> Values:
     if seen.reading is None:
         return [], 1
     size = np.sort(np.abs(seen.reading).ravel())
-    least, most = LOWEST * len(size), len(size) - FEWEST
+    fewest = FEWEST if len(size) >= LEVELS.series else FEWEST_OF_FEW
+    least, most = LOWEST * len(size), len(size) - fewest
     if most <= least:
         return [], 1
-    beyond = np.unique(np.geomspace(len(size) - least, FEWEST, LEVELS_TRIED).astype(int))
+    beyond = np.unique(np.geomspace(len(size) - least, fewest, LEVELS_TRIED).astype(int))
     several = np.unique([float(f"{size[-b]:.6g}") for b in beyond])
     # Rows of one pose are predicted alike: what nothing exceeds but by rounding is no level.
-    levels = [float(v) for v in several if np.count_nonzero(size > v * (1 + 1e-6)) >= FEWEST]
+    levels = [float(v) for v in several if np.count_nonzero(size > v * (1 + 1e-6)) >= fewest]
     return [(v,) for v in levels], max(len(levels), 1)
 
 
