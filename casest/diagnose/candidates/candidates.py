@@ -21,6 +21,7 @@ from casest.effects import shipped
 from casest.effects.placing import angles, placed_in, with_numbers
 from casest.errors import CasestError, UsageError
 from casest.leastsquares.kinds import noises
+from casest.units import known, size
 
 #: Columns whose name or unit says that they are temperatures.
 _TEMPERATURE = re.compile(r"temp|(^|_)t_?(deg)?c$|celsius|kelvin", re.IGNORECASE)
@@ -29,6 +30,8 @@ _DEGREES = {"degC", "K", "kelvin", "degree_Celsius", "°C"}
 SMOOTH = ("frequency", "timescale", "memory", "lag", "level", "floor", "threshold", "band")
 #: Where effects act that go with what a sensor gives.
 READINGS = ("input", "output")
+#: What an effect that bends over a column calls its second size.
+BEND = "bend"
 #: Which columns an effect asks for: temperatures, others, both.
 WARM = {"temperature": (True,), "other": (False,), "any": (True, False)}
 #: Columns that number things instead of measuring them.
@@ -187,6 +190,7 @@ def candidates(
             try:
                 told = with_numbers(placed, columns, runs, model)
                 candidate = replace(candidate, effect=told)
+                _refuse_two_values(candidate, runs)
                 if any(c.label == candidate.label and c.effect == told for c in found):
                     continue  # of the catalogue, and asked for with its column
                 found.append(_tried(candidate, model, runs))
@@ -309,8 +313,15 @@ def channels(
             continue
         values[name] = x
         unit = runs[0].column_units.get(name) or ""
-        found[name] = bool(_TEMPERATURE.search(name)) or unit in _DEGREES
+        found[name] = _is_temperature(name, unit)
     return found, skipped
+
+
+def _is_temperature(name: str, unit: str) -> bool:
+    """A unit that says something else is believed, whatever the name (tempo in s)."""
+    if unit and known(unit) and "count" not in unit and size(unit)[1] != size("K")[1]:
+        return False
+    return bool(_TEMPERATURE.search(name)) or unit in _DEGREES
 
 
 def _named(name: str) -> str:
@@ -349,6 +360,17 @@ def _tried(candidate: Candidate, model: Model, runs: Sequence[Run]) -> Candidate
     # In the form that it takes in this model.
     own = replace(extended.effects[-1].effect, on=effect.on)
     return replace(candidate, effect=own)
+
+
+def _refuse_two_values(candidate: Candidate, runs: Sequence[Run]) -> None:
+    """What bends over a column of two values is what goes along it."""
+    effect = candidate.effect
+    bends = effect is not None and shipped(effect) and BEND in dict(effect.declarations)
+    if not bends or candidate.column is None:
+        return
+    several = [np.unique(run.signals[candidate.column]) for run in runs]
+    if len(np.unique(np.concatenate(several))) < 3:
+        raise UsageError("the column has two values: what bends over it is what goes along it")
 
 
 def _refuse_more_than_data(extended: Model, runs: Sequence[Run]) -> None:

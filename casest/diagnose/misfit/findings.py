@@ -51,6 +51,8 @@ _KIN = float(np.exp(-1 / MEMORY))
 OF_COLOUR = (1.5 - 2 * _KIN + 0.5 * _KIN**2) / 1.5
 
 
+#: Means within a window by which it is told how strong a slow course is there.
+WITHIN = 8
 #: Share of faults among readings, at most: 1 to 10 % are usual (F. Hampel et al., 1986, 1.2c).
 FAULTS = 0.1
 
@@ -228,13 +230,17 @@ def _slow(
 
 def _when(problem: Problem, clipped: Sequence[Array], samples: int) -> str:
     """Where it is strongest: a stretch of time, across no gap."""
+    from scipy.ndimage import uniform_filter1d
+
     best: tuple[float, str] = (0.0, "")
     for run, r in zip(problem.runs, clipped, strict=True):
         if run.time is None or len(r) < 3 * samples:
             continue
-        sums = np.vstack([np.zeros((1, r.shape[1])), np.cumsum(r, axis=0)])
         first, last = _windows(blocks(run.time, run.block, np.arange(len(r))), samples)
-        taken = np.sum((sums[last] - sums[first]) ** 2, axis=1) / (last - first)
+        # Not by its mean: where it turns round it has none.
+        course = uniform_filter1d(r, max(samples // WITHIN, 1), axis=0, mode="nearest")
+        squares = np.concatenate([[0.0], np.cumsum(np.sum(course**2, axis=1))])
+        taken = (squares[last] - squares[first]) / (last - first)
         k = int(np.argmax(taken))
         if taken[k] > best[0]:
             a, b = run.time[first[k]], run.time[min(last[k], len(r)) - 1]

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import fdtrc
 
-from casest.declaration.effect import Attached
 from casest.declaration.shapes import Array
 from casest.diagnose.evidence.linear import Index
 from casest.diagnose.formula.search import NAME as FORMULA
@@ -30,7 +29,7 @@ from casest.estimate.reasons import Code
 from casest.leastsquares.kinds import noises
 
 #: Why an effect is not kept that the last fit makes nothing of.
-NO_SIZE = "in the end its size may as well be nothing"
+NO_SIZE = "beside what is left unexplained its size may be chance"
 
 
 def certified(sensor: Sensor, state: State[Fit], before: Estimate) -> tuple[State[Fit], Estimate]:
@@ -65,7 +64,9 @@ def certified(sensor: Sensor, state: State[Fit], before: Estimate) -> tuple[Stat
         others = {rival.what.label for rival in last.rivals}
         rivals = (e for e in beside.found if others.issuperset(e.families))
         nameless = ANOTHER in why or last.what.label == FORMULA
-        own = (*rivals,) if nameless else (last.evidence, *rivals)
+        # Of a pair the evidence is both's.
+        again = tuple(e for e in beside.found if e.families == (last.what.label,))
+        own = (*rivals,) if nameless else (*(again or (last.evidence,)), *rivals)
         state = replace(left_in(state, fit), open=(*own, *state.open), last=beside)
 
 
@@ -117,50 +118,54 @@ def _chance_of_nothing(sensor: Sensor, state: State[Fit], kept: Kept, after: Est
     deviations of none, were noise alike everywhere: then only rows that count less, or a colour of
     the noise, had spoken for it. Of a formula each term is one more that was looked for: none may
     be nothing."""
-    attached = _attached(kept.what.label, after)
-    if attached is None:
-        return 0.0
-    z = [np.abs(after.values[n]) / after.plain[n] for n in _sizes(attached) if n in after.plain]
+    names, none = _sizes(kept.what.label, after), _none(sensor, kept)
+    z = [np.abs(after.values[n] - none) / after.plain[n] for n in names if n in after.plain]
     if z and all(bool(np.all(one < LEVELS.apart)) for one in z):
         return 1.0
-    if attached.effect.name == FORMULA:
-        z = [np.abs(after.values[n]) / after.std[n] for n in _sizes(attached)]
+    if kept.what.name == FORMULA:
+        z = [np.abs(after.values[n]) / after.std[n] for n in names]
         if any(bool(np.any(one < LEVELS.apart)) for one in z):
             return 1.0
     return printed_chance(sensor, state, kept, after)
 
 
-def chance_of_sizes(label: str, after: Estimate) -> float:
-    """The chance of an effect's sizes by the standard deviations that are printed of them; 0 of
-    one that has none. A likelihood beside slow noise weighs what is quick, they weigh all of it."""
-    attached = _attached(label, after)
-    own = _places(_sizes(attached), after) if attached is not None else np.zeros(0, int)
+def chance_of_sizes(label: str, after: Estimate, none: float = 0.0) -> float:
+    """The chance of a cause's sizes by the standard deviations that are printed of them; 0 of one
+    that has none. A likelihood beside slow noise weighs what is quick, they weigh all of it.
+
+    `none`: the size at which it is none.
+    """
+    own = _places(_sizes(label, after), after)
     C = after.covariance[np.ix_(own, own)]
     if not own.size or not np.isfinite(C).all():
         return 0.0
     freedom = float(np.array(after.effective_freedom)[own].min())
-    return _by_chance(after.point.x[own], C, freedom)
+    return _by_chance(after.point.x[own] - none, C, freedom)
 
 
 def printed_chance(sensor: Sensor, state: State[Fit], kept: Kept, after: Estimate) -> float:
     """The chance of a cause beside the others: no less than that of its sizes, or of one that has
     none, in rows without a time, than what rows that are alike leave of it."""
     label = kept.what.label
-    attached = _attached(label, after)
-    if attached is None or _sizes(attached):
-        least = chance_of_sizes(label, after)
+    if _sizes(label, after):
+        least = chance_of_sizes(label, after, _none(sensor, kept))
     else:
         least = chance_in_rows(sensor, state, kept, after.correlated_over)
     return max(least, chance_alone(sensor, state, kept))
 
 
-def _attached(label: str, after: Estimate) -> Attached | None:
-    return next((a for a in after.model.effects if a.label == label), None)
+def _none(sensor: Sensor, kept: Kept) -> float:
+    """The size at which a cause is none: of a constant that is wrong, what was declared."""
+    held = sensor.model[kept.what.freed].array if kept.what.freed else np.zeros(())
+    return float(held) if not held.ndim else 0.0
 
 
-def _sizes(attached: Attached) -> set[str]:
-    """Parameters of an effect that are none where it is none: those that are searched over a grid
+def _sizes(label: str, after: Estimate) -> set[str]:
+    """Parameters of a cause that are none where it is none: those that are searched over a grid
     only where there are no others (a lag)."""
+    attached = next((a for a in after.model.effects if a.label == label), None)
+    if attached is None:
+        return {label} & set(after.values)
     searched, null = dict(attached.effect.profile), attached.effect.null_of
     own = {p.name: p.name.rpartition(".")[2] for p in attached.parameters}
     sizes = {name for name, word in own.items() if word not in searched}

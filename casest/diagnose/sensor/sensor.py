@@ -253,12 +253,18 @@ class Sensor(Subject[Fit]):
         """The fit without an effect that was added."""
         known = self._without.of(fit, dict)
         if what.label not in known:
-            known[what.label] = None if what.freed else self._fitted_without(fit, what)
+            less = self._less(fit, what)
+            known[what.label] = self.fitted(less.model, less.values)
         return known[what.label]
 
-    def _fitted_without(self, fit: Fit, what: Candidate) -> Fit | None:
-        less = _less(fit, what)
-        return self.fitted(less.model, less.values)
+    def _less(self, fit: Fit, what: Candidate) -> Fit:
+        """A cause taken out, all else where it is: a constant that was freed is held again."""
+        if not what.freed:
+            return _less(fit, what)
+        held = self.model[what.freed].array
+        model = fit.model.having(**{what.freed: held if held.ndim else float(held)})
+        values = {n: v for n, v in fit.values.items() if n != what.freed}
+        return replace(fit, model=model, values=values)
 
     def unlike(self, fit: Fit) -> str:
         """Why an effect in a fit is not what its name says there; else empty."""
@@ -266,7 +272,7 @@ class Sensor(Subject[Fit]):
 
     def instead(self, fit: Fit, what: Candidate, added: Sequence[Trial]) -> Fit | str:
         """The fit with these in the place of an effect that was added, from where it is."""
-        return "it is no effect" if what.freed else self._refit(_less(fit, what), added)
+        return self._refit(self._less(fit, what), added)
 
     def replaced(self, fit: Fit, what: Candidate, other: Candidate, seen: Fit) -> Fit | None:
         """The fit with another effect in the place of one that was added, as it was fitted there
@@ -274,7 +280,7 @@ class Sensor(Subject[Fit]):
         labels = {a.label for a in fit.model.effects} - {what.label} | {other.label}
         if {a.label for a in seen.model.effects} == labels:
             return seen
-        less = _less(fit, what)
+        less = self._less(fit, what)
         own = [a for a in seen.model.effects if a.label == other.label]
         model = replace(less.model, effects=(*less.model.effects, *own))
         return self.fitted(model, starts(model, self.runs, {**seen.values, **less.values}))
@@ -370,12 +376,7 @@ class Sensor(Subject[Fit]):
 
     def _residual_without(self, fit: Fit, what: Candidate) -> Array:
         """Residuals (N, m) of the model without an effect, at the values of the fit."""
-        less = _less(fit, what)
-        if what.freed:
-            held = self.model[what.freed].array
-            model = fit.model.having(**{what.freed: held if held.ndim else float(held)})
-            values = {n: v for n, v in fit.values.items() if n != what.freed}
-            less = replace(fit, model=model, values=values)
+        less = self._less(fit, what)
         problem = Problem(less.model, self.runs)
         point = problem.point(less.values)
         residuals = whitened(problem, point).residuals(point)
