@@ -18,9 +18,9 @@ from casest.leastsquares.problem import Point, Problem
 REACH = (1, 2, 4, 8, 16)
 
 
-def averages(problem: Problem, point: Point) -> list[Array] | None:
-    """Of each run, what the mean of a row, those before and those after does beside the row alone,
-    over each reach (N, m, k); None of a model that predicts no reading, or by a trajectory.
+def averages(problem: Problem, point: Point, *, after: bool = True) -> list[Array] | None:
+    """Of each run, what the mean of a row, those before and those `after` does beside the row
+    alone, over each reach (N, m, k); None of a model that predicts no reading, or by a trajectory.
 
     Means of what is predicted: of an input behind a memory they are those of the memory's.
     """
@@ -31,7 +31,7 @@ def averages(problem: Problem, point: Point) -> list[Array] | None:
     for run, residual in zip(problem.runs, problem.residuals(point), strict=True):
         predicted = run.signals[measured] - residual
         parts = np.split(predicted, np.flatnonzero(np.diff(run.block)) + 1)
-        found.append(np.concatenate([_of_stretch(part) for part in parts]))
+        found.append(np.concatenate([_of_stretch(part, after) for part in parts]))
     return found
 
 
@@ -46,9 +46,11 @@ def best_mean(residual: Array, basis: Array, columns: Array) -> Array | None:
     return (flat @ weights).reshape(residual.shape) if np.any(weights) else None
 
 
-def _of_stretch(x: Array) -> Array:
-    """Second differences of values (N, m) over each reach: (N, m, k)."""
+def _of_stretch(x: Array, after: bool) -> Array:
+    """Second differences of values (N, m) over each reach: (N, m, k); first ones where no row after
+    counts."""
     count, most = len(x), max(REACH)
     padded = np.pad(x, ((most, most), (0, 0)), mode="edge")
     shifted = {k: padded[most + k : most + k + count] for r in REACH for k in (-r, r)}
-    return np.stack([shifted[-r] + shifted[r] - 2 * x for r in REACH], axis=2)
+    ahead = {r: shifted[r] - x if after else 0.0 for r in REACH}
+    return np.stack([shifted[-r] - x + ahead[r] for r in REACH], axis=2)

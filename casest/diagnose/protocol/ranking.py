@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 
 from casest.declaration.shapes import Array
-from casest.diagnose.evidence.input_noise import feigned
+from casest.diagnose.evidence.input_noise import at_most, feigned
 from casest.diagnose.evidence.likelihood import Beyond, Likelihood, far_out
 from casest.diagnose.evidence.linear import Linear
 from casest.diagnose.evidence.score import (
@@ -76,7 +76,11 @@ def without_feigned(
     charged: dict[int, Evidence] = {}
     for e in asked:
         gains = [feigned(e, likelihood, _columns(e, draws)) for draws in inputs]
-        charged[id(e)] = less(e, max(gains, default=0.0), likelihood, families)
+        gain = max(gains, default=0.0)
+        if gain > 0 and len(e.trials) == 1:
+            mirror = subject.gain_backward(fit, e.trials[0])
+            gain = min(gain, at_most(mirror, len(likelihood.residual)))
+        charged[id(e)] = less(e, gain, likelihood, families)
     return tuple(charged.get(id(e), e) for e in found)
 
 

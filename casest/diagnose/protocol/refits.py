@@ -143,7 +143,8 @@ def feigned_between(subject: Subject[F], before: F, after: F) -> float | None:
     """What noise of the inputs gains in a refit on average; None where there is no saying."""
     one, other = subject.linear(before), subject.linear(after)
     gains = [feigned_by_refit(one, other, draws) for draws in subject.noise_in(before, after)]
-    return max((g for g in gains if g is not None), default=None)
+    found = max((g for g in gains if g is not None), default=None)
+    return min(found, subject.gained_backward(before, after)) if found else found
 
 
 def _gaining(evidence: Evidence, gain: float) -> Evidence:

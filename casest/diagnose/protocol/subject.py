@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from math import inf
 from typing import Any, Protocol
 
 from casest.declaration.shapes import Array
@@ -54,6 +55,15 @@ class Subject(Protocol[F]):
         """For each noisy input a few draws: how much of its noise, and what that adds to the
         residuals (N, m) of two fits."""
         return ()
+
+    def gain_backward(self, fit: F, trial: Trial) -> float:
+        """What a memory would gain beside a fit, were time to run backward: noise of the inputs has
+        no more of it. Infinite where there is no saying."""
+        return inf
+
+    def gained_backward(self, before: F, after: F) -> float:
+        """The same of the one memory that a fit has more than another, at its value there."""
+        return inf
 
     def nearer(self, fit: F, trial: Trial, scale: float) -> Sequence[Trial]:
         """Variants of a trial around its value on a grid."""

@@ -46,13 +46,21 @@ class Rows:
         if mean is None:
             return found
         most = share_taken(found, mean) > LEVELS.most
+        if most and self._comes_late(fit, found, mean):
+            return found
         return replace(found, feigned=mean[:, :, None], counts=most)
 
-    def best_mean(self, fit: Fit, linear: Linear) -> Array | None:
-        """What the best mean of inputs over rows before and after takes away (N, m)."""
+    def _comes_late(self, fit: Fit, linear: Linear, mean: Array) -> bool:
+        """Do rows before alone take more than those before and after? Noise of inputs is in both."""
+        before = self.best_mean(fit, linear, after=False)
+        plain = replace(linear, counts=False)
+        return before is not None and share_taken(plain, before) > share_taken(plain, mean)
+
+    def best_mean(self, fit: Fit, linear: Linear, *, after: bool = True) -> Array | None:
+        """What the best mean of inputs over rows before, and `after`, takes away (N, m)."""
         if not self._spans:
             return None
-        found = averages(*problem_of(fit, self.runs))
+        found = averages(*problem_of(fit, self.runs), after=after)
         if found is None:
             return None
         told = np.any(linear.residual, axis=1) | np.any(linear.slopes, axis=(1, 2))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -31,6 +32,7 @@ from casest.diagnose.sensor.fits import (
     starts,
 )
 from casest.diagnose.sensor.jitter import Draw, in_refit, jittered
+from casest.diagnose.sensor.mirrored import gain_backward
 from casest.diagnose.sensor.recent import Recent
 from casest.diagnose.sensor.rows import Rows
 from casest.diagnose.sensor.to_both_sides import to_both_sides
@@ -94,6 +96,10 @@ class Sensor(Subject[Fit]):
         return Recent(16)
 
     @cached_property
+    def _backward(self) -> Recent[Fit, dict[tuple[str, Any], float]]:
+        return Recent()
+
+    @cached_property
     def _on_rates(self) -> Recent[Fit, dict[str, Fit | str]]:
         return Recent()
 
@@ -137,6 +143,26 @@ class Sensor(Subject[Fit]):
     ) -> Sequence[Sequence[tuple[float, Array, Array, Array]]]:
         """What noise of each input adds to the residuals of two fits."""
         return in_refit(self.rows, before, after)
+
+    def gain_backward(self, fit: Fit, trial: Trial) -> float:
+        """What a memory would gain beside a fit, were time to run backward."""
+        known, what = self._backward.of(fit, dict), trial.what
+        if (what.label, what.held) not in known:
+            known[what.label, what.held] = gain_backward(self.rows, fit, what)
+        return known[what.label, what.held]
+
+    def gained_backward(self, before: Fit, after: Fit) -> float:
+        """The same of the one memory that a fit has more than another, at its value there."""
+        there = {a.label for a in before.model.effects}
+        added = [a for a in after.model.effects if a.label not in there]
+        if len(added) != 1 or len(after.model.effects) != len(there) + 1:
+            return np.inf
+        label = added[0].label
+        what = next((c for c in self.tried.found(before)[0] if c.label == label), None)
+        if what is None or what.effect is None:
+            return np.inf
+        held = [(n, float(after.values.get(f"{label}.{n}", 0.0))) for n, _ in what.effect.profile]
+        return gain_backward(self.rows, before, replace(what, held=tuple(held)))
 
     def nearer(self, fit: Fit, trial: Trial, scale: float) -> list[Trial]:
         """Values of a grid around the trial's."""
