@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
+from scipy.signal import lfilter
 
 from casest import close
 
@@ -89,3 +90,20 @@ def test_gains_of_axes_are_no_noise_of_the_reference(tmp_path):
     assert found.averaged < 0.5
     named = {name for e in found.effects for name in (e.candidate.label, *e.indistinguishable_from)}
     assert named & {"axis_gain", "soft_iron", "gain_matrix"}
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(s, marks=pytest.mark.long) for s in (1, 2))])
+def test_a_command_that_is_never_still_has_no_noise_that_a_motor_averages(seed):
+    """A controller's output and a motor's speed, 50 ms behind: all of what the low pass explains
+    was said to be noise of the command (p = 1), which is none: rows after a reading tell nothing
+    of it."""
+    rng, n, fine = np.random.default_rng([50, seed]), 3000, 10
+    slow = lfilter([1], [1, -0.98], rng.standard_normal(n))
+    command = 0.5 + 0.02 * slow + 0.05 * lfilter([1], [1, -0.3], rng.standard_normal(n))
+    held, share = np.repeat(command, fine), np.exp(-0.01 / fine / 0.05)
+    speed = lfilter([1 - share], [1, -share], held, zi=[share * held[0]])[0][::fine]
+    speed = 300 + 900 * speed + 3 * rng.standard_normal(n)
+    found = close("linear", {"t": 0.01 * np.arange(n), "reference": command, "reading": speed})
+    assert "low_pass" in {e.candidate.label for e in found.effects}
+    assert found.after.values["low_pass.tau"] == pytest.approx(0.05, rel=0.05)
+    assert found.after.values["gain"] == pytest.approx(900, rel=0.01)  # 700 without

@@ -81,11 +81,14 @@ def eliminated(subject: Subject[F], state: State[F]) -> State[F]:
 
 
 def chance_alone(subject: Subject[F], state: State[F], kept: Kept) -> float:
-    """p of a cause beside all others, by its refit: of a pair the evidence is both's."""
+    """p of a cause beside all others, by its refit: of a pair the evidence is both's. Where another
+    does its work without it, and is not what its name says there, that of when it was added."""
     if len(state.kept) == len(kept.evidence.trials) == 1:
         return kept.evidence.p_value
     base = subject.without(state.fit, kept.what)
-    return kept.evidence.p_value if base is None else _alone(subject, state, kept, base)[1]
+    if base is None or subject.unlike(base):
+        return kept.evidence.p_value
+    return _alone(subject, state, kept, base)[1]
 
 
 def chance_in_rows(subject: Subject[F], state: State[F], kept: Kept, over: float) -> float:

@@ -1,14 +1,13 @@
-"""A memory that runs backward: what it explains is no response of the sensor.
+"""The mirror image of a memory, about its own mean delay: what it explains may be noise and a lag.
 
 Noise of an input is as much in the rows before a reading as in those after. So what a memory gains
-by averaging it away, the same memory gains if time ran backward. What a sensor does comes late: its
-mirror image leads, and gains less. So noise of the inputs has no more of a memory than its mirror
-image explains.
+by averaging it away, its mirror image gains as well, moved to be as late on average: what is left
+between the two is how a sensor responds, at once and then more and more slowly. Noise of the inputs
+has no more of a memory than its mirror image explains.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,13 +16,11 @@ from casest.data.run import Run
 from casest.declaration.effect import OVER_TIME
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import Candidate
-from casest.diagnose.candidates.slopes import slopes
 from casest.diagnose.evidence.likelihood import Likelihood
-from casest.diagnose.evidence.linear import Index
 from casest.diagnose.evidence.score import Trial, judged
 from casest.diagnose.sensor.fits import Fit, problem_of
 from casest.diagnose.sensor.rows import Rows
-from casest.errors import CasestError
+from casest.leastsquares.problem import Problem
 
 #: What is searched over in a memory that averages: a time constant.
 AVERAGING = {"memory", "timescale"}
@@ -32,28 +29,47 @@ SAME = 1e-6
 
 
 def gain_backward(rows: Rows, fit: Fit, what: Candidate) -> float:
-    """What a memory at its held values would gain beside a fit, were time to run backward; infinite
-    where there is no saying: of no memory, of a fit that looks at other times itself.
+    """What the mirror image of a memory at its held values gains beside a fit; infinite where there
+    is no saying: of no memory, of a fit that looks at other times itself.
 
-    Only where it averages (its size is above zero): the mirror image of a lag is a lead, and one
-    below zero is the lag again.
+    Only where it averages (its size is above zero).
     """
-    linear = rows.linear(fit)
-    if not _averages(what) or not linear.coloured or _looks_elsewhere(fit):
+    linear, measured = rows.linear(fit), fit.model.traced.measured
+    if not _averages(what) or not linear.coloured or _looks_elsewhere(fit) or not measured:
         return np.inf
     runs = tuple(map(_backward, rows.runs))
     forward, there = problem_of(fit, rows.runs)
-    problem, point = problem_of(fit, runs)
-    residuals = zip(forward.residuals(there), problem.residuals(point), strict=True)
-    if any(np.abs(a - b[::-1]).max() > SAME * fit.noise for a, b in residuals):
+    before, plain = forward.residuals(there), Problem(fit.model, runs)
+    same = zip(before, plain.residuals(plain.point(fit.values)), strict=True)
+    if max(np.abs(a - b[::-1]).max() for a, b in same) > SAME * fit.noise:
         return np.inf  # it goes with the time
-    index = [len(run) - 1 - own[::-1] for run, own in zip(rows.runs, rows.index, strict=True)]
-    ((_, columns),) = slopes(problem, point, [what], index)
-    if isinstance(columns, CasestError):
-        return np.inf
-    columns = np.concatenate([part[::-1] for part in _by_run(columns, index)])
-    likelihood = Likelihood(linear)
-    return _gain_above_zero(likelihood, columns)
+    whole = what.free().added_to(fit.model)
+    new = {p.name: p.shape.dims for p in whole.parameters if p.name not in fit.values}
+    times = {f"{what.label}.{n}": v for n, v in what.held}
+    sizes = [name for name in new if name not in times]  # of one all of the response is late
+    values = {name: np.full(dims, times.get(name, 1.0)) for name, dims in new.items()}
+    problem = Problem(whole, runs)
+    residuals = problem.residuals(problem.point({**fit.values, **values}))
+    delay = 2 * max(v for n, v in what.held if n in _times(what))
+    moved = []
+    for run, r, own in zip(rows.runs, before, residuals, strict=True):
+        mirror = _late(run.signals[measured] - own[::-1], run, delay)
+        change = mirror - (run.signals[measured] - r)
+        each = change[:, :, None] * np.eye(change.shape[1]) if sizes else change[:, :, None]
+        moved.append(each)
+    return _gain_above_zero(Likelihood(linear), rows.of(moved) * linear.root[:, :, None])
+
+
+def _late(x: Array, run: Run, delay: float) -> Array:
+    """Values (N, m) of each stretch as they were some time before; what was before it nobody
+    knows."""
+    assert run.time is not None
+    found, t = x.copy(), np.asarray(run.time, float)
+    for block in np.unique(run.block):
+        own = run.block == block
+        for k in range(x.shape[1]):
+            found[own, k] = np.interp(t[own] - delay, t[own], x[own, k])
+    return found
 
 
 def _gain_above_zero(likelihood: Likelihood, columns: Array) -> float:
@@ -63,8 +79,7 @@ def _gain_above_zero(likelihood: Likelihood, columns: Array) -> float:
         found = judged([Trial(None, "", columns)], likelihood, none)
         if found is None:
             break
-        sizes = found.beyond.mix @ found.explained.values[-found.freedom :]
-        above = sizes > 0
+        above = found.beyond.mix @ found.explained.values[-found.freedom :] > 0
         if above.all():
             return max(found.gain, 0.0)
         columns = columns[:, :, above]
@@ -75,18 +90,18 @@ def _averages(what: Candidate) -> bool:
     effect = what.effect
     if effect is None or effect.kind != "sequence":
         return False
-    times = [n for n, kind in effect.profile if kind in AVERAGING]
     held = dict(what.held)
-    return bool(times) and all(held.get(n, 0.0) > 0 for n in times)
+    return bool(_times(what)) and all(held.get(n, 0.0) > 0 for n in _times(what))
+
+
+def _times(what: Candidate) -> set[str]:
+    profile = what.effect.profile if what.effect is not None else ()
+    return {n for n, kind in profile if kind in AVERAGING}
 
 
 def _looks_elsewhere(fit: Fit) -> bool:
     model = fit.model
     return model.along.integrates or any(a.kind in OVER_TIME for a in model.effects)
-
-
-def _by_run(columns: Array, index: Sequence[Index]) -> list[Array]:
-    return np.split(columns, np.cumsum([len(own) for own in index])[:-1])
 
 
 def _backward(run: Run) -> Run:

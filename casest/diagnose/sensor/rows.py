@@ -51,7 +51,7 @@ class Rows:
         return replace(found, feigned=mean[:, :, None], counts=most)
 
     def _comes_late(self, fit: Fit, linear: Linear, mean: Array) -> bool:
-        """Do rows before alone take more than those before and after? Noise of inputs is in both."""
+        """Do rows before alone take more than before and after? Noise of inputs is in both."""
         before = self.best_mean(fit, linear, after=False)
         plain = replace(linear, counts=False)
         return before is not None and share_taken(plain, before) > share_taken(plain, mean)

@@ -161,7 +161,8 @@ class Sensor(Subject[Fit]):
         what = next((c for c in self.tried.found(before)[0] if c.label == label), None)
         if what is None or what.effect is None:
             return np.inf
-        held = [(n, float(after.values.get(f"{label}.{n}", 0.0))) for n, _ in what.effect.profile]
+        names = {n: f"{label}.{n}" for n, _ in what.effect.profile}
+        held = [(n, float(np.ravel(after.values.get(full, 0.0))[0])) for n, full in names.items()]
         return gain_backward(self.rows, before, replace(what, held=tuple(held)))
 
     def nearer(self, fit: Fit, trial: Trial, scale: float) -> list[Trial]:
