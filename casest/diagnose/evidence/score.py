@@ -26,9 +26,10 @@ class Trial:
 
     `what` it is to whom asks; `family` its name for all that is a variant of it; `variants`: how
     many were looked through; `axes` (k,): the axis that each column belongs to, where that is a
-    matter of axes; `describes`: it is no cause, but what a cause must explain more than; `feigned`:
-    gain that noise of the inputs alone may give it; `secant`: all of it is held, and the columns
-    are what it changes at that value, not a slope.
+    matter of axes; `among`: of how many choices of axes it is the best; `describes`: it is no
+    cause, but what a cause must explain more than; `feigned`: gain that noise of the inputs alone
+    may give it; `secant`: all of it is held, and the columns are what it changes at that value, not
+    a slope.
     """
 
     what: Any
@@ -39,6 +40,12 @@ class Trial:
     describes: bool = False
     feigned: float = 0.0
     secant: bool = False
+    among: int = 1
+
+    @property
+    def choices(self) -> int:
+        """Of axes, of which the best is taken, or was."""
+        return self.among if self.axes is None else 2 ** len(np.unique(self.axes)) - 1
 
 
 @dataclass(frozen=True)

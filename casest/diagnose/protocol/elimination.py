@@ -136,7 +136,9 @@ def _looked_through(subject: Subject[F], state: State[F], kept: Kept) -> int:
         return 1
     if not subject.asked(kept.what):
         return state.first.families
-    return max(1, sum(subject.asked(e.trials[0].what) for e in state.first.found))
+    asked = max(1, sum(subject.asked(e.trials[0].what) for e in state.first.found))
+    own = next((t for t in kept.evidence.trials if t.what == kept.what), None)
+    return asked if own is None else asked * own.choices
 
 
 def _beside_the_others(

@@ -73,9 +73,10 @@ def refitted(
         kept = _gaining(evidence, gain)
         if subject.asked(evidence.trials[0].what):
             gain = min(gain, noisier[0])
-            kept = with_chance(_gaining(evidence, gain), ranking.likelihood, asked)
+            shared = asked * evidence.trials[0].choices
+            kept = with_chance(_gaining(evidence, gain), ranking.likelihood, shared)
             plain = _gaining(evidence, gain + evidence.feigned)
-            chance = with_chance(plain, ranking.likelihood, asked).p_value
+            chance = with_chance(plain, ranking.likelihood, shared).p_value
             why = NONE_OF_IT.format(chance) if chance >= LEVELS.chance else ""
             why = why or _refused(kept, subject.linear(state.fit), subject.linear(better))
             if why:

@@ -309,4 +309,5 @@ def on_axes(fit: Fit, trial: Trial, axes: Sequence[int]) -> Trial:
     assert trial.axes is not None
     less = replace(candidate, effect=restricted(candidate.effect, axes, fit.model), traced=None)
     own = np.isin(trial.axes, list(axes))
-    return replace(trial, what=less, columns=trial.columns[:, :, own], axes=None)
+    columns = trial.columns[:, :, own]
+    return replace(trial, what=less, columns=columns, axes=None, among=trial.choices)
