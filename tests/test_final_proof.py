@@ -15,7 +15,7 @@ from casest.diagnose.sensor import Sensor
 from casest.diagnose.sensor.final import NO_SIZE, certified, left_in
 from casest.effects import CATALOGUE
 from casest.effects.placing import prepared
-from casest_problems.one_channel import linear
+from casest_problems.one_channel import linear, polynomial
 
 
 def record(signals, t, warm):
@@ -138,3 +138,20 @@ def test_a_cause_goes_whose_place_a_later_one_has_taken(seed):
     assert k not in after.values
     ((_, why),) = [(r.what.label, r.why) for r in state.refused]
     assert why == NO_SIZE
+
+
+def test_a_freed_constant_goes_like_an_effect_where_it_may_be_as_declared():
+    """No quartic is in the record, whatever had spoken for one: it stayed, beside a p of another
+    fit."""
+    rng, x = np.random.default_rng(4), np.linspace(-1, 1, 200)
+    y = 0.2 + 1.1 * x + 0.3 * x**2 + 0.01 * rng.standard_normal(200)
+    run = Run.raw("r", {"reference": x[:, None], "reading": y[:, None]}, units={})
+    sensor = Sensor(polynomial, prepared(polynomial, [run]), CATALOGUE)
+    before = attempt(polynomial, sensor.runs)
+    fit = sensor.fitted(before.model, before.values)
+    trial = next(t for t in sensor.trials(fit) if t.what.freed == "quartic")
+    state = State(sensor.refit(fit, [trial]), (kept_of(sensor, fit, trial),))
+    state, after = certified(sensor, state, before)
+    assert state.kept == ()
+    assert [(r.what.label, r.why) for r in state.refused] == [("quartic", NO_SIZE)]
+    assert "quartic" not in after.values

@@ -72,8 +72,8 @@ def certified(sensor: Sensor, state: State[Fit], before: Estimate) -> tuple[Stat
 
 def left_in(state: State[Fit], fit: Fit) -> State[Fit]:
     """At a fit with less in it: with a cause goes the lag of a column that it alone read."""
-    there = {a.label for a in fit.model.effects}
-    kept = tuple(k for k in state.kept if k.what.freed or k.what.label in there)
+    there = {a.label for a in fit.model.effects} | {p.name for p in fit.model.parameters}
+    kept = tuple(k for k in state.kept if k.what.label in there)
     return replace(state, fit=fit, kept=kept)
 
 
