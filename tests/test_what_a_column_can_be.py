@@ -1,4 +1,4 @@
-"""What a column is by its values and its unit: two values bend nothing, seconds are no temperature."""
+"""What a column is by its values and its unit: two values bend nothing, seconds are not warm."""
 
 from __future__ import annotations
 
