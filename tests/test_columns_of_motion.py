@@ -9,6 +9,7 @@ import pytest
 
 from casest.cli import run
 from casest.diagnose.candidates.motion_columns import columns_of_motion
+from casest.effects.placing import prepared
 
 
 def turning(seed, size=500):
@@ -101,5 +102,15 @@ def test_axes_of_another_sensor_are_known_whatever_it_is_called(tmp_path, names,
     path, model = tmp_path / "r.csv", find_model("norm-diagonal")
     head = ",".join(["v_x", "v_y", "v_z", *columns])
     np.savetxt(path, rows, delimiter=",", header=head, comments="")
-    runs = load_runs([str(path)], model.signals)
+    runs = prepared(model, load_runs([str(path)], model.signals))
     assert columns_of_motion(model, runs) == (set(columns) if motion else set())
+
+
+def test_three_columns_of_words_are_no_vector(tmp_path):
+    from casest import load_runs
+    from casest.results.find import find_model
+
+    path, model = tmp_path / "r.csv", find_model("norm-diagonal")
+    path.write_text("v_x,v_y,v_z,note1,note2,note3\n1,0,0,a,b,c\n0,1,0,d,e,f\n0,0,1,a,b,g\n")
+    runs = prepared(model, load_runs([str(path)], model.signals))
+    assert columns_of_motion(model, runs) == set()

@@ -366,9 +366,9 @@ def _refuse_two_values(candidate: Candidate, runs: Sequence[Run]) -> None:
     """What bends over a column of two values is what goes along it."""
     effect = candidate.effect
     bends = effect is not None and shipped(effect) and BEND in dict(effect.declarations)
-    if not bends or candidate.column is None:
-        return
-    several = [np.unique(run.signals[candidate.column]) for run in runs]
+    if not bends or any(candidate.column not in run.signals for run in runs):
+        return  # none that was recorded
+    several = [np.unique(run.signals[str(candidate.column)]) for run in runs]
     if len(np.unique(np.concatenate(several))) < 3:
         raise UsageError("the column has two values: what bends over it is what goes along it")
 

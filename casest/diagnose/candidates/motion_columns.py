@@ -47,10 +47,12 @@ def _axes_of_a_vector(runs: Sequence[Run]) -> set[str]:
     """Columns without a unit that are three by their names, and do not go alike: another sensor's
     axes, whatever it is called. Three thermometers do go alike."""
     units = runs[0].column_units
-    unknown = [n for n in runs[0].columns if not _says(units.get(n))]
+    # What is a number in all runs is a signal of each.
+    numbers = [n for n in runs[0].columns if all(n in run.signals for run in runs)]
+    unknown = [n for n in numbers if not _says(units.get(n))]
     found = set[str]()
     for group in vectors(unknown):
-        columns = [np.concatenate([run.columns[n] for run in runs]) for n in group]
+        columns = [np.concatenate([run.signals[n][:, 0] for run in runs]) for n in group]
         with np.errstate(invalid="ignore"):
             untold = 1 - np.corrcoef(columns) ** 2
         if np.nanmax(untold, initial=0.0) > LEVELS.stand_in:
