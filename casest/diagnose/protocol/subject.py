@@ -57,8 +57,8 @@ class Subject(Protocol[F]):
         return ()
 
     def gain_backward(self, fit: F, trial: Trial) -> float:
-        """What a memory would gain beside a fit, were time to run backward: noise of the inputs has
-        no more of it. Infinite where there is no saying."""
+        """What the mirror image of a memory, about its own delay, gains beside a fit: noise of the
+        inputs has no more of it. Infinite where there is no saying."""
         return inf
 
     def gained_backward(self, before: F, after: F) -> float:

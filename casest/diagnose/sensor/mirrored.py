@@ -41,8 +41,8 @@ def gain_backward(rows: Rows, fit: Fit, what: Candidate) -> float:
     forward, there = problem_of(fit, rows.runs)
     before, plain = forward.residuals(there), Problem(fit.model, runs)
     same = zip(before, plain.residuals(plain.point(fit.values)), strict=True)
-    if max(np.abs(a - b[::-1]).max() for a, b in same) > SAME * fit.noise:
-        return np.inf  # it goes with the time
+    if not max(np.abs(a - b[::-1]).max() for a, b in same) <= SAME * fit.noise:
+        return np.inf  # it goes with the time, or is no number somewhere
     whole = what.free().added_to(fit.model)
     new = {p.name: p.shape.dims for p in whole.parameters if p.name not in fit.values}
     times = {f"{what.label}.{n}": v for n, v in what.held}

@@ -145,7 +145,7 @@ class Sensor(Subject[Fit]):
         return in_refit(self.rows, before, after)
 
     def gain_backward(self, fit: Fit, trial: Trial) -> float:
-        """What a memory would gain beside a fit, were time to run backward."""
+        """What the mirror image of a memory, about its own delay, gains beside a fit."""
         known, what = self._backward.of(fit, dict), trial.what
         if (what.label, what.held) not in known:
             known[what.label, what.held] = gain_backward(self.rows, fit, what)
