@@ -92,7 +92,8 @@ def test_gains_of_axes_are_no_noise_of_the_reference(tmp_path):
     assert named & {"axis_gain", "soft_iron", "gain_matrix"}
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(s, marks=pytest.mark.long) for s in (1, 2))])
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_command_that_is_never_still_has_no_noise_that_a_motor_averages(seed):
     """A controller's output and a motor's speed, 50 ms behind: all of what the low pass explains
     was said to be noise of the command (p = 1), which is none: rows after a reading tell nothing

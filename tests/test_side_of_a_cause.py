@@ -17,6 +17,7 @@ def play(x, width):
     return found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("slack", "said"), [("reference", True), ("reading", False)])
 def test_whose_play_it_is(tmp_path, capsys, slack, said):
     rng, t = np.random.default_rng(1), 0.02 * np.arange(1500)
