@@ -220,7 +220,7 @@ def test_a_dependence_on_the_angle_names_it_though_it_goes_round():
     run = Run.raw("r", {"angle": angle[:, None], "y": y[:, None]}, units={})
     found = judged(run, encoder)
     assert found.significant
-    assert "of it follows turned" in found.where
+    assert "of it follows angle" in found.where  # `turned` is what the user gave, as it is
 
 
 def test_positions_that_are_off_by_more_than_their_repeats_scatter_are_a_misfit():

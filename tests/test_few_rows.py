@@ -11,7 +11,8 @@ from scipy import stats
 from casest import close
 from casest.cli import run
 from casest.diagnose.levels import LEVELS
-from casest.diagnose.misfit.few_rows import few_rows
+from casest.diagnose.misfit.few_rows import at_the_ends, few_rows
+from casest.diagnose.misfit.variables import Variable
 
 
 def table(rng, rows, axes, unknowns, off=()):
@@ -65,6 +66,54 @@ def test_the_rows_are_those_of_all_that_could_be_chosen(seed):
     F = (np.sum(r**2) - left(best)) / 2 / (left(best) / 9)
     assert found.p_value == pytest.approx(stats.f.sf(F, 2, 9) * 91 * 3)
     assert found.share == pytest.approx(1 - left(best) / left([]))
+
+
+def variable(name, *values, **flags):
+    return Variable(name, tuple(np.asarray(v, float) for v in values), **flags)
+
+
+def test_rows_at_the_ends_of_an_input_are_called_that():
+    """A hyperbola by a line: the nearest rows are no faults, whatever order they were taken in."""
+    rng = np.random.default_rng(0)
+    x = rng.permutation(np.linspace(3, 40, 38))
+    near = np.flatnonzero(x < np.sort(x)[5])
+    other = variable("other", rng.standard_normal(38))
+    assert at_the_ends(near, [other, variable("gap", x)]) == "one end of gap"
+    assert at_the_ends(np.r_[near, np.argmax(x)], [variable("gap", x)]) == "both ends of gap"
+    assert at_the_ends(near[near != np.argmin(x)], [variable("gap", x)]) == ""
+    assert at_the_ends(np.arange(5), [variable("place", np.arange(38), clock=True)]) == (
+        "one end of the record"
+    )
+
+
+def test_rows_that_are_chosen_at_random_are_at_no_end():
+    """Three of 14 rows, of four variables: four of 364 choices each."""
+    rng, found = np.random.default_rng(1), 0
+    for _ in range(2000):
+        read = [variable(f"x{k}", rng.standard_normal(14)) for k in range(4)]
+        found += at_the_ends(rng.permutation(14)[:3], read[:1]) != ""
+        assert at_the_ends(np.array([0, 5]), read) == ""  # of two rows: 4 · 3 / 91
+    assert found == 0
+    chances = [
+        at_the_ends(rng.permutation(30)[:3], [variable("x", rng.standard_normal(30))]) != ""
+        for _ in range(5000)
+    ]
+    assert stats.binom.ppf(5e-4, 5000, 4 / 4060) <= sum(chances)
+    assert sum(chances) <= stats.binom.ppf(1 - 5e-4, 5000, 4 / 4060)
+
+
+@pytest.mark.long
+def test_a_hyperbola_that_is_fitted_by_a_line_has_no_faulty_rows(tmp_path, capsys):
+    """A distance by infrared light, of which it was said that the others speak against five."""
+    d = np.arange(3.0, 41.0)
+    rows = np.column_stack([d, np.round(12.2 / (d + 0.9) + 0.03, 2)])
+    np.savetxt(tmp_path / "ir.csv", rows, delimiter=",", header="gap [cm],u [V]", comments="")
+    named = ["--columns", "reference=gap", "--columns", "reading=u"]
+    assert run(["close", "linear", str(tmp_path / "ir.csv"), *named]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "unexplained: a misfit remains in rows 0, 1, 2 and 3 of ir, at one end of ref" in said
+    assert "speak against" not in said
+    assert "of it follows reference" in said
 
 
 def test_where_nothing_is_determined_no_row_is_looked_for():

@@ -92,8 +92,8 @@ class Unexplained(Struct, frozen=True):
     """What is left: share of the held-out variance, where; causes of which none was added.
 
     `described_by`: effects that a slow course looks like, and that name no cause; `in_rows`: the
-    few rows that most of it is in, in words; `share`: of the held-out variance, that `one_of`
-    explain, null where there are none.
+    few rows that most of it is in, in words; `at_ends`: of what they are the outermost; `share`: of
+    the held-out variance, that `one_of` explain, null where there are none.
     """
 
     fraction: Number
@@ -103,6 +103,7 @@ class Unexplained(Struct, frozen=True):
     would_separate: list[str]
     described_by: list[str] = []
     in_rows: str = ""
+    at_ends: str = ""
     share: Number = None
 
 
@@ -294,6 +295,7 @@ def _unexplained(closing: Closing) -> Unexplained:
         _measurements(names, closing) if len(names) > 1 else [],
         list(closing.misfit.described),
         closing.misfit.rows,
+        closing.misfit.ends,
         plain(left.share) if left else None,
     )
 

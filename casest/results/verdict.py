@@ -97,7 +97,8 @@ def _elsewhere(result: Closed) -> str:
 def _which(left: Unexplained) -> str:
     """What is known of a misfit: where it is, or what explains it alike."""
     if left.in_rows:
-        return f" in {left.in_rows}, which the others speak against"
+        why = f"at {left.at_ends}" if left.at_ends else "which the others speak against"
+        return f" in {left.in_rows}, {why}"
     share, alike = left.share or 0.0, f"{_several(left.one_of)} explain" if left.one_of else ""
     if not alike or share < LEVELS.share:
         return " that no candidate explains"

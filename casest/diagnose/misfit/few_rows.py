@@ -3,11 +3,13 @@
 A fit of few rows bends towards one that is off, and that row no longer stands out. So those few are
 looked for that leave the others the least squares (P. Rousseeuw 1984), near the fit; the chance is
 that of the F test of their own shifts, times the number of ways to choose them: a bound for normal
-noise.
+noise. Where they are just those at the ends of something recorded, it is no fault of theirs that
+shows: the model may not reach that far.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import comb
 
@@ -16,6 +18,7 @@ import numpy as np
 from casest.declaration.shapes import Array
 from casest.diagnose.evidence.linear import Index
 from casest.diagnose.levels import LEVELS
+from casest.diagnose.misfit.variables import Variable
 
 #: Rows at least, such rows at most, and as a share of all.
 FEWEST, MOST_ROWS, SHARE = 6, 5, 0.25
@@ -65,6 +68,24 @@ def few_rows(residual: Array, slopes: Array, rounding: float = 0.0) -> FewRows |
         if share > LEVELS.most and chance < LEVELS.chance:
             best = FewRows(np.setdiff1d(np.arange(rows), kept), share, chance)
     return best
+
+
+def at_the_ends(rows: Index, variables: Sequence[Variable]) -> str:
+    """Which ends of which variable these rows (k,) are, that no others are beyond; empty where
+    rows that are chosen at random would be as well, or they are anywhere.
+
+    Of k of N rows k + 1 choices are the outermost: so many at one end, and the rest at the other.
+    """
+    ranked = [v for v in variables if not v.turns]
+    for v in ranked:
+        x = np.concatenate(v.values)
+        own, others = x[rows], np.delete(x, rows)
+        low, high = own < others.min(), own > others.max()
+        chance = (len(rows) + 1) / comb(len(x), len(rows)) * len(ranked)
+        if np.all(low | high) and chance < LEVELS.chance:
+            ends = "both ends" if low.any() and high.any() else "one end"
+            return f"{ends} of {'the record' if v.clock else v.name}"
+    return ""
 
 
 def _left(residual: Array, Q: Array, kept: Index) -> tuple[Array, Array]:

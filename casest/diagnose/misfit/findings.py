@@ -16,7 +16,7 @@ from casest.declaration.effect import TAILS
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import usable_columns
 from casest.diagnose.levels import LEVELS
-from casest.diagnose.misfit.few_rows import few_rows
+from casest.diagnose.misfit.few_rows import at_the_ends, few_rows
 from casest.diagnose.misfit.noisy_inputs import beside_noise_of_inputs
 from casest.diagnose.misfit.pure_error import pure_error
 from casest.diagnose.misfit.reference import along_reference
@@ -60,7 +60,8 @@ FAULTS = 0.1
 @dataclass(frozen=True)
 class Finding:
     """Evidence of a misfit: where, in words; its share of the squares, or else σ of the noise
-    beside it; `slow`: it is a course of unknown cause; `rows`: the few that it is in, in words.
+    beside it; `slow`: it is a course of unknown cause; `rows`: the few that it is in, in words, and
+    `ends`: of what they are the outermost.
     """
 
     where: str
@@ -69,6 +70,7 @@ class Finding:
     sigma: float = np.inf
     slow: bool = False
     rows: str = ""
+    ends: str = ""
 
 
 def findings(
@@ -144,7 +146,8 @@ def _far_out(problem: Problem, sigma: float) -> list[Finding]:
 
 
 def in_few_rows(problem: Problem, point: Point) -> list[Finding]:
-    """Rows of a table that the others speak against, and that hold most of what is left."""
+    """Rows of a table that the others speak against, or that are at the ends of something, and hold
+    most of what is left."""
     runs, tails = problem.runs, any(a.effect.seen_in == TAILS for a in problem.model.effects)
     if sum(map(len, runs)) >= LEVELS.series or tails or problem.sequential:
         return []
@@ -154,8 +157,14 @@ def in_few_rows(problem: Problem, point: Point) -> list[Finding]:
     if found is None:
         return []
     listed = " and ".join(_named(runs, found.rows))
-    where = f"{100 * found.share:.0f} % of it is in {listed}, which the others speak against"
-    return [Finding(where, found.p_value, found.share, rows=listed)]
+    columns = usable_columns(problem.model, runs)
+    read = variables(problem, point, columns)
+    if problem.model.implicit:  # a reading that is off is beyond the others in what it makes
+        read = [v for v in read if v.clock or v.name in columns]
+    ends = at_the_ends(found.rows, read)
+    why = f"at {ends}" if ends else "which the others speak against"
+    where = f"{100 * found.share:.0f} % of it is in {listed}, {why}"
+    return [Finding(where, found.p_value, found.share, rows=listed, ends=ends)]
 
 
 def _named(runs: Sequence[Run], rows: NDArray[np.int_]) -> list[str]:

@@ -87,7 +87,8 @@ class Misfit:
     """What is left beyond noise: share of the held-out variance, and where it lives.
 
     `noise` holds what is known of the noise itself; `described` names what a slow
-    course in it looks like; `rows`: the few that most of it is in, in words.
+    course in it looks like; `rows`: the few that most of it is in, in words, and `ends`: of what
+    they are the outermost.
     """
 
     significant: bool
@@ -96,6 +97,7 @@ class Misfit:
     noise: Mapping[str, Any]
     described: tuple[str, ...] = ()
     rows: str = ""
+    ends: str = ""
 
 
 def left_over(
@@ -155,9 +157,9 @@ def left_over(
         looks = " or ".join(_looks_like(c.what) for c in said)
         where.append(f"its slow course is best described by {looks}")
     names = tuple(c.what.label for c in said)
-    rows = next((f.rows for f in found if f.rows), "")
+    rows, ends = next(((f.rows, f.ends) for f in found if f.rows), ("", ""))
     fraction = min(float(fraction), 1.0)
-    return Misfit(bool(where), fraction, "; ".join(where), noise.content, names, rows)
+    return Misfit(bool(where), fraction, "; ".join(where), noise.content, names, rows, ends)
 
 
 def _looks_like(candidate: Candidate) -> str:

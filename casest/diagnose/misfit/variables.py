@@ -35,11 +35,12 @@ def variables(problem: Problem, point: Point, columns: Sequence[str]) -> list[Va
     runs = problem.runs
     timed = all("t" in run.signals for run in runs)
     name = "time" if timed else "place in the record"
-    found = [Variable(name, tuple(_when(run, timed) for run in runs), clock=True)]
-    found += [Variable(n, tuple(run.signals[n][:, 0] for run in runs)) for n in columns]
+    when = Variable(name, tuple(_when(run, timed) for run in runs), clock=True)
+    found = [Variable(n, tuple(run.signals[n][:, 0] for run in runs)) for n in columns]
     if not problem.sequential:
         found += _quantities(problem, point)
-    return _distinct(found)
+    # A table that was sorted by something says that, and not the place of its rows.
+    return _distinct([when, *found] if timed else [*found, when])
 
 
 def _when(run: Run, timed: bool) -> Array:
@@ -52,6 +53,7 @@ def _quantities(problem: Problem, point: Point) -> Iterator[Variable]:
     The noise of an implicit model's reading is in its quantities too, and would correlate.
     """
     traced, implicit = problem.model.traced, problem.model.implicit
+    given = [s.name for s in problem.model.signals if s.name not in traced.readings]
     for quantity in traced.quantities.values():
         value = ca.vec(ca.SX(quantity.value))
         if not ca.depends_on(value, sample_symbol(problem.model)):
@@ -66,10 +68,18 @@ def _quantities(problem: Problem, point: Point) -> Iterator[Variable]:
             for r, s in enumerate(problem.samples)
         ]
         for k in range(per_run[0].shape[1]):
-            name = quantity.name + (f"[{k}]" if per_run[0].shape[1] > 1 else "")
             values = tuple(v[:, k] for v in per_run)
+            own = quantity.name + (f"[{k}]" if per_run[0].shape[1] > 1 else "")
+            name = next((n for n in given if _is_signal(problem, n, values)), own)
             turns = quantity.unit == "rad" and max(map(np.ptp, values)) > 2 * np.pi
             yield Variable(name, values, bool(turns))
+
+
+def _is_signal(problem: Problem, name: str, values: Sequence[Array]) -> bool:
+    """Is a component just what the user gave for this signal, whatever the model calls it?"""
+    given = [run.signals[name] for run in problem.runs]
+    both = list(zip(given, values, strict=True))
+    return all(g.shape[1:] == (1,) and np.array_equal(g[:, 0], v) for g, v in both)
 
 
 def _consistent(problem: Problem, value: Any) -> Any:
