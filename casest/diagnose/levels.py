@@ -53,6 +53,7 @@ class Levels:
         is slower than a rest (bias instability) is not in that scatter, and no misfit of its own.
     rounded: residual over a step of the reading below which rounding alone (1/√12 = 0.29) may be
         all of it.
+    half: of a step of the reading: as far is each from what it rounds.
     outliers: log-likelihood over that of Student's t from which on samples are outliers: t noise of
         3 to 6 degrees of freedom gets there in less than one of a hundred records.
     louder: median third difference, in that of three quarters of the blocks, from which on
@@ -110,6 +111,7 @@ class Levels:
     block: int = 20
     lacks: float = 1.5
     rounded: float = 0.45
+    half: float = 0.5
     outliers: float = 4.0
     louder: float = 2.0
     jump: float = 10.0

@@ -43,8 +43,6 @@ from casest.leastsquares.weights import scale_of_readings, weighted
 REPEATED = 1e6
 #: Residuals of so many rounding errors of one are exact.
 ROUNDED = 10.0
-#: Of a step of the reading: as far is each from what it rounds.
-HALF = 0.5
 #: Variance of neighbours' differences from the line between them, in that of the noise, where noise
 #: remembers as exp(−k/MEMORY).
 _KIN = float(np.exp(-1 / MEMORY))
@@ -111,7 +109,7 @@ def findings(
 
 def _clipped(problem: Problem, residuals: Sequence[Array], sigma: float) -> list[Array]:
     """Residuals, those far out counted as less, as the fit does: none that a step away may be."""
-    least = HALF * step_of(problem.runs, problem.model.traced.measured)
+    least = LEVELS.half * step_of(problem.runs, problem.model.traced.measured)
     limit, kept = LEVELS.clip * max(sigma, least), problem.weights
     found = [np.clip(r, -limit, limit) for r in residuals]
     return found if kept is None else [r * w for r, w in zip(found, kept, strict=True)]
@@ -124,7 +122,7 @@ def _repeats(
     if tested is None or tested.p_value >= LEVELS.misfit:
         return []
     size = float(np.sqrt(np.mean(np.concatenate(clipped) ** 2)))
-    if size < HALF * step_of(problem.runs, problem.model.traced.measured):
+    if size < LEVELS.half * step_of(problem.runs, problem.model.traced.measured):
         return []  # what is held between two steps is read as one of them
     ratio = float(np.sqrt(tested.F))
     where = f"between {tested.between}: the residual is {ratio:.1f} times what the scatter "

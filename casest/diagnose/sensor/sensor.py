@@ -45,6 +45,7 @@ from casest.diagnose.sensor.unlike import (
     smooth,
     stands_in,
     too_slow,
+    within_rounding,
 )
 from casest.engine.kernel import only_tried
 from casest.errors import CasestError
@@ -214,6 +215,7 @@ class Sensor(Subject[Fit]):
             too_slow(after.values, added, spans)
             or another(after.model, after.values, self.model)[1]
             or stands_in(before, after, found, self.rows)
+            or (found and within_rounding(before, after, self.runs))
             or driven(before, after, added, self.rows)
             or to_both_sides(before, after, added, self.rows)
             or smooth(self.linear(before), self.linear(after), found, self.rows.met(before))

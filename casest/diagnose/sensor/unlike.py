@@ -17,10 +17,12 @@ from casest.diagnose.candidates.candidates import Candidate
 from casest.diagnose.evidence.linear import Linear
 from casest.diagnose.evidence.score import Trial
 from casest.diagnose.levels import LEVELS
+from casest.diagnose.noise.noise_model import step_of
 from casest.diagnose.protocol.state import ANOTHER, STANDS_IN
 from casest.diagnose.sensor.fits import Fit, problem_of
 from casest.diagnose.sensor.rows import Rows, instant
 from casest.leastsquares.problem import Problem
+from casest.leastsquares.weights import scale_of_readings
 
 #: Powers of what the sensor met, of which the best are a smooth bend.
 POWERS = range(2, 9)
@@ -87,6 +89,28 @@ def smooth(before: Linear, after: Linear, added: Sequence[Candidate], met: Array
     if float(r @ r) - max(gains) >= float(np.sum(after.residual**2)):
         return ""
     return f"a smooth bend of as many unknowns leaves less than a kink: {ANOTHER}"
+
+
+def within_rounding(before: Fit, after: Fit, runs: Sequence[Run]) -> str:
+    """Why columns or effects are none: readings were rounded, to a step that may be all that is
+    left, and no prediction changes by more than half of one; else empty.
+
+    What rounding leaves is no noise: it hangs on the input, and so goes with anything that does.
+    """
+    measured = before.model.traced.measured
+    step = step_of(runs, measured)
+    if not step > 0 or after.model.traced.measured != measured:
+        return ""
+    left, other = (
+        np.concatenate([r.ravel() for r in problem.residuals(point)])
+        for problem, point in (problem_of(fit, runs) for fit in (before, after))
+    )
+    if left.shape != other.shape or scale_of_readings([left]) >= LEVELS.rounded * step:
+        return ""
+    most = float(np.abs(other - left).max(initial=0.0)) / step
+    if most > LEVELS.half:
+        return ""
+    return f"nowhere more than {most:.2g} steps of the reading: rounding may be all of it"
 
 
 def too_slow(
