@@ -91,7 +91,7 @@ def smooth(before: Linear, after: Linear, added: Sequence[Candidate], met: Array
     return f"a smooth bend of as many unknowns leaves less than a kink: {ANOTHER}"
 
 
-def within_rounding(before: Fit, after: Fit, runs: Sequence[Run]) -> str:
+def within_rounding(before: Fit, after: Fit, runs: tuple[Run, ...]) -> str:
     """Why columns or effects are none: readings were rounded, to a step that may be all that is
     left, and no prediction changes by more than half of one; else empty.
 
