@@ -46,7 +46,7 @@ from casest.solve.trust_region import trust_region  # noqa: E402
 
 KEPT, TABLE = ROOT / "out" / "loop_worlds.jsonl", ROOT / "studies" / "loop_worlds.md"
 #: Effects that are a property of the noise or describe a course: they claim no cause.
-DESCRIBING = {"outliers", "bias_wander", "reference_wander", "bias_course"}
+DESCRIBING = {"outliers", "bias_wander", "reference_wander", "bias_course", "bias_ramp"}
 
 
 # -- a world as casest sees it ---------------------------------------------------------------------

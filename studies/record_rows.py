@@ -20,7 +20,7 @@ LAG = frozenset({"time_delay", "signal_lag", "axis_delay"})
 SKEW = frozenset({"cross_axis", "soft_iron", "gain_matrix"})
 IRON = SKEW | {"axis_gain", "table_angle"}
 MEMORY = frozenset({"low_pass", "creep", "hysteresis"}) | LAG
-SLOW = frozenset({"bias_drift", "bias_course", "warm_up", "bias_step", "pulse"})
+SLOW = frozenset({"bias_drift", "bias_course", "bias_ramp", "warm_up", "bias_step", "pulse"})
 BY_TEMPERATURE = frozenset({"temperature_bias", "temperature_curve"})
 BY_COLUMN = frozenset({"channel_bias", "channel_curve"})
 #: Even in the reading: not to be told apart at readings of one length.

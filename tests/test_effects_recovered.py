@@ -244,7 +244,7 @@ def test_every_run_has_a_course_of_its_own():
 
 def test_what_describes_a_course_says_so_and_names_no_cause():
     described = {e.name for e in effects.CATALOGUE if e.describes}
-    assert described == {"reference_wander", "bias_course", "bias_wander"}
+    assert described == {"reference_wander", "bias_course", "bias_ramp", "bias_wander"}
 
 
 # -- columns ---------------------------------------------------------------------------------------
@@ -349,6 +349,7 @@ SEARCHED = {
     "stop": 1.5,
     "tau": 2.0,
     "level": 0.5,
+    "begin": 0.6,
 }
 #: Where nothing is still, and no axis points along another.
 SOMEWHERE = {

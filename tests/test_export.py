@@ -392,7 +392,8 @@ def test_a_lag_stays_in_and_every_form_says_so(tmp_path, capsys):
     [("axis_delay", True), ("low_pass", True), ("hysteresis", True), ("imbalance", False),
      ("temperature_bias", False), ("bias_drift", False), ("quadratic", False),
      ("saturation", False), ("soft_iron", False), ("gain_matrix", False), ("gain_by_sign", False),
-     ("warm_up", False), ("pulse", False), ("reference_wander", True), ("bias_course", True)],
+     ("warm_up", False), ("pulse", False), ("reference_wander", True), ("bias_course", True),
+     ("bias_ramp", True)],
 )  # fmt: skip
 def test_what_acts_on_a_rate_or_describes_a_record_is_left_and_nothing_else(name, left):
     found = next(e for e in CATALOGUE if e.name == name)

@@ -256,3 +256,34 @@ def test_a_lag_that_is_asked_for_is_judged_by_its_own_f_test():
     counts = 2 * np.interp(t, fine, course) + rng.normal(0, 0.3, 85)
     closing = close("linear", {**given, "reading": counts}, known=["signal_lag(reference)"])
     assert not closing.effects
+
+
+def height(rng):
+    """A height that goes to and fro, and how fast it does, by a filter that is not quite it."""
+    t = 0.02 * np.arange(3000)
+    parts = [(0.4, 0.31, 0.2), (0.2, 0.83, 1.1), (0.05, 2.9, 2.0)]
+    z = sum(a * np.sin(w * t + p) for a, w, p in parts)
+    speed = sum(a * w * np.cos(w * (t - 0.05) + p) for a, w, p in parts)
+    return t, z, speed + 0.03 * rng.standard_normal(t.size)
+
+
+@pytest.mark.long
+def test_the_speed_of_an_input_is_no_influence_beside_its_lag():
+    """Of a drone's height a lag of 0.155 s was printed, and its speed beside it."""
+    rng = np.random.default_rng(3)
+    t, z, speed = height(rng)
+    reading = np.interp(t - 0.12, t, z) + 0.004 * rng.standard_normal(t.size)
+    closing = close("linear", {"t": t, "reference": z, "reading": reading, "vz": speed})
+    assert "column is how fast reference changes" in skipped(closing)["vz"]
+    assert [e.candidate.label for e in closing.effects] == ["signal_lag(reference)"]
+    assert closing.after.values["signal_lag(reference).delay"] == pytest.approx(0.12, abs=0.002)
+
+
+@pytest.mark.long
+def test_a_speed_of_something_else_is_an_influence_still():
+    rng = np.random.default_rng(4)
+    t, z, _ = height(rng)
+    wind = np.sin(0.57 * t) + 0.6 * np.sin(1.7 * t + 1)
+    reading = z + 0.01 * wind + 0.004 * rng.standard_normal(t.size)
+    closing = close("linear", {"t": t, "reference": z, "reading": reading, "wind": wind})
+    assert [e.candidate.label for e in closing.effects] == ["channel_bias(wind)"]

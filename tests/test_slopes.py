@@ -37,6 +37,7 @@ def recorded(name, count, seed):
 #: One value of what is searched over; others are held at what they are told.
 HELD = {
     "time": 6.0, "level": 12.0, "floor": 3.0, "frequency": 2.3, "timescale": 1.7, "share": 0.05,
+    "onset": 5.0,
 }  # fmt: skip
 VALUES = {"zero": np.array([0.31, -0.19]), "gain": np.array([0.49, 0.52])}
 

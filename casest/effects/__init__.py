@@ -22,7 +22,7 @@ from casest.effects.columns import (
     temperature_gain,
     temperature_gain_curve,
 )
-from casest.effects.course import bias_course, reference_wander
+from casest.effects.course import bias_course, bias_ramp, reference_wander
 from casest.effects.motion import (
     axis_wobble,
     imbalance,
@@ -122,6 +122,7 @@ CATALOGUE: tuple[Effect, ...] = (
     forcing,
     reference_wander,
     bias_course,
+    bias_ramp,
     bias_wander,
     outliers,
 )

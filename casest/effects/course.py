@@ -1,9 +1,9 @@
-"""Smooth courses of time, as sums of Legendre's polynomials over the record."""
+"""Courses of time: smooth, as sums of Legendre's polynomials over the record, or from a time on."""
 
 from __future__ import annotations
 
 from casest.declaration.effect import effect
-from casest.declaration.physics import SX
+from casest.declaration.physics import SX, fmax
 from casest.declaration.shapes import each
 from casest.declaration.symbols import constant, param, signal
 
@@ -63,3 +63,21 @@ def bias_course(
     """The offset of each axis follows a smooth course of its own, for whatever reason."""
     course = legendre(t, duration, 6)[1:]
     return y + sum(c * p for c, p in zip((c1, c2, c3, c4, c5, c6), course, strict=True))
+
+
+@effect(
+    on="output",
+    typical={"k": 0.01},
+    profile={"begin": "onset"},
+    shown_by="the same pose again and again through the record",
+    formula="y + k·max(t − begin, 0)",
+    describes=True,
+)
+def bias_ramp(
+    y: SX, t: SX = signal("s"), *, k: SX = param(each, "[y]/s"), begin: SX = param("s")
+) -> SX:
+    """The offset grows from a moment on: something warms, or a field fades.
+
+    A jump that it foretells as well is none.
+    """
+    return y + k * fmax(t - begin, 0)

@@ -100,7 +100,7 @@ def _which(left: Unexplained) -> str:
         why = f"at {left.at_ends}" if left.at_ends else "which the others speak against"
         return f" in {left.in_rows}, {why}"
     share, alike = left.share or 0.0, f"{_several(left.one_of)} explain" if left.one_of else ""
-    if not alike or share < LEVELS.share:
+    if not alike or share < LEVELS.share * (left.fraction or 0.0):
         return " that no candidate explains"
     part = share < LEVELS.most * (left.fraction or 0.0)
     return f", of which {alike} {percent(share)}" if part else f" that {alike} alike"

@@ -19,8 +19,8 @@ from casest.diagnose.levels import LEVELS
 
 #: Values on each grid: moments beside the best one, edges of pulses, levels, time constants, lines.
 MOMENTS, EDGES, PULSES, LEVELS_TRIED, CONSTANTS, LINES = 15, 60, 10, 24, 8, 3
-#: Lags of a recorded signal, each way.
-LAGS = 8
+#: Lags of a recorded signal, each way; moments from which on something may grow.
+LAGS, ONSETS = 8, 24
 #: Shares of a span in which a loop may turn round.
 SHARES = (0.003, 0.01, 0.03, 0.1, 0.3)
 #: The shortest time constant, in samples: a shorter one is a delay.
@@ -115,6 +115,8 @@ def searched(
     if kinds == ("share",):
         turned = _turned_back(seen)
         return [(float(v),) for v in SHARES if v <= turned], len(SHARES)
+    if kinds == ("onset",):
+        return _onsets(seen)
     if kinds == ("time",):
         return _moments(seen)
     if kinds == ("time", "time"):
@@ -226,6 +228,13 @@ def _moments(seen: Seen) -> Values:
     even = np.linspace(edge, n - edge, MOMENTS).astype(int)
     chosen = sorted({best, *even.tolist()})
     return [(_between(seen.time, k),) for k in chosen if 0 < k < n], n
+
+
+def _onsets(seen: Seen) -> Values:
+    assert seen.time is not None
+    n = len(seen.time)
+    rows = (np.arange(1, ONSETS) * n) // ONSETS
+    return [(float(seen.time[k]),) for k in rows if 0 < k < n], ONSETS
 
 
 def _pulses(seen: Seen) -> Values:

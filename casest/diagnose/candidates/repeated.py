@@ -24,6 +24,8 @@ from casest.diagnose.levels import LEVELS
 MOST = 0.5
 #: Swings of an input in the record at least: of fewer any two slow courses are alike.
 SWINGS = 3
+#: Parts of a record over each of which a speed is summed up: its noise goes out of it there.
+PARTS = 50
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,20 @@ class Signal:
         own = _scaled(x[k:-k])
         left = own - later @ np.linalg.lstsq(later, own, rcond=None)[0]
         return float(left @ left) < LEVELS.repeated
+
+    def is_integral_of(self, x: Array, time: Array) -> bool:
+        """Does the input go, in each part of the record, as far as a column (N,) sums up to, to and
+        fro? What follows the speed of an input is what a lag of it makes."""
+        k, y = len(x) // PARTS, self.elements[:, 0]
+        if not self.input or self.elements.shape[1] != 1 or k < 1:
+            return False
+        steps = np.maximum(np.diff(time), 0.0)  # from run to run: none
+        summed = np.concatenate([[0.0], np.cumsum(0.5 * (x[1:] + x[:-1]) * steps)])
+        gone, went = _scaled(summed[k:] - summed[:-k]), _scaled(y[k:] - y[:-k])
+        ways = np.sign(went[np.abs(went) > 0.5 * went.std()])
+        if np.sum(ways[1:] != ways[:-1]) < 2 * SWINGS:
+            return False
+        return float(gone @ went) ** 2 > 1 - LEVELS.stand_in
 
     def taken_by(self, x: Array) -> bool:
         """Would a column (N,) and its square tell most of what inputs leave of a reading, and take
@@ -102,6 +118,7 @@ class Reads:
     signals: tuple[Signal, ...]
     rows: slice
     columns: Mapping[str, Array] = field(default_factory=dict, repr=False)
+    time: Array | None = field(default=None, repr=False)
 
     def again(self, x: Array) -> str:
         """Which of them a column (N,) is once more, in words; else empty."""
@@ -120,7 +137,12 @@ class Reads:
         if made := self._made_of(x):
             return f"column is made of {made[0]} and {made[1]}, computed from both"
         late = next((s.name for s in self.signals if s.at_other_times(x)), "")
-        return late and f"column is {late} at other times: what follows it could be a lag of it"
+        if late:
+            return f"column is {late} at other times: what follows it could be a lag of it"
+        time = self.time
+        sums = (s.name for s in self.signals if time is not None and s.is_integral_of(x, time))
+        of = next(sums, "")
+        return of and f"column is how fast {of} changes: what follows it could be a lag of it"
 
     def _made_of(self, x: Array) -> tuple[str, str] | None:
         """A signal of one element and another column of which it is the difference, or of a reading
@@ -181,7 +203,9 @@ def signals_of(inputs: Collection[str], readings: Collection[str], runs: Sequenc
         for name in (runs[0].columns if runs else ())
         if name not in each and all(name in run.signals for run in runs)
     }
-    return Reads(tuple(found), rows, columns)
+    times = [run.time for run in runs if run.time is not None]
+    time = np.concatenate(times)[rows] if len(times) == len(runs) > 0 else None
+    return Reads(tuple(found), rows, columns, time)
 
 
 def _quarter(x: Array) -> int:

@@ -37,7 +37,10 @@ def refined(subject: Subject[F], fit: F, ranking: Ranking) -> Ranking:
     found = tuple(on_its_axes(subject, fit, e, ranking) for e in ranking.found)
     found = without_feigned(subject, fit, ranking.likelihood, found, ranking.families)
     ranking = _about_the_best(replace(ranking, found=best_first(found)))
-    near = [e for e in ranking.causes[: LEVELS.contenders] if e.score > -LEVELS.clear]
+    # What describes a course is compared with causes that are: at its own best as they are.
+    courses = [e for e in ranking.courses if e.trials[0].what.held]
+    near = [*ranking.causes[: LEVELS.contenders], *courses]
+    near = [e for e in near if e.score > -LEVELS.clear]
     finer = {e.trials[0].family: _finer(subject, fit, ranking, e, whole) for e in near}
     found = tuple(finer.get(e.trials[0].family, e) for e in ranking.found)
     found = without_feigned(subject, fit, ranking.likelihood, found, ranking.families)
