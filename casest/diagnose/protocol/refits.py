@@ -185,14 +185,27 @@ def beyond_courses(ranking: Ranking, evidence: Evidence) -> bool:
     if not _strong(ranking, evidence):
         return False
     if len(evidence.trials) == 1:
-        return all(_more_than(c, evidence, ranking) for c in ranking.descriptions[:1])
+        courses = _against(ranking.descriptions, evidence.trials[0])
+        return all(_more_than(c, evidence, ranking) for c in courses[:1])
     for trial in evidence.trials:
         others = [t for t in evidence.trials if t is not trial]
-        beside = (_together(c, others, ranking) for c in ranking.courses)
+        beside = (_together(c, others, ranking) for c in _against(ranking.courses, trial))
         best = max((e for e in beside if e), key=lambda e: e.score, default=None)
         if best is not None and not _more_than(best, evidence, ranking):
             return False
     return True
+
+
+def _against(courses: Sequence[Evidence], trial: Trial) -> list[Evidence]:
+    """Those that a cause must lead: what begins at a moment of its own only where it does as well,
+    since nearly any slow cause looks like that."""
+    event = _at_moments(trial)
+    return [c for c in courses if event or not _at_moments(c.trials[0])]
+
+
+def _at_moments(trial: Trial) -> bool:
+    effect = trial.what.effect
+    return effect is not None and bool({"time", "onset"} & set(dict(effect.profile).values()))
 
 
 def _more_than(course: Evidence, evidence: Evidence, ranking: Ranking) -> bool:
