@@ -54,8 +54,8 @@ class Effect:
     `null` maps each parameter to the value at which the effect vanishes (0 unless told).
     For tracing a residual: `typical` sizes of the parameters, each in its unit; `profile` the
     parameters that are searched over a grid (name -> "frequency", "time", "timescale", "level",
-    "floor", "share", "lag" or "onset"), because the effect is not smooth in them, or has many
-    valleys; `shown_by` the measurement that shows it; `plain` the form that it is tried in once it was
+    "floor", "share", "lag" or "onset"), because it is not smooth in them, or has many valleys;
+    `shown_by` the measurement that shows it; `plain` the form that it is tried in once it was
     found; `columns` the argument for which a recorded column is looked for (name -> "temperature",
     "other", "any", "angle", which is also a scalar signal or quantity of the model in rad or deg,
     or "acceleration", another measured signal of three axes; on a rate "itself", the state whose

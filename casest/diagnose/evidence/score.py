@@ -27,9 +27,9 @@ class Trial:
     `what` it is to whom asks; `family` its name for all that is a variant of it; `variants`: how
     many were looked through; `axes` (k,): the axis that each column belongs to, where that is a
     matter of axes; `among`: of how many choices of axes it is the best; `describes`: it is no
-    cause, but what a cause must explain more than; `feigned`: gain that noise of the inputs alone
-    may give it; `secant`: all of it is held, and the columns are what it changes at that value, not
-    a slope.
+    cause, but what a cause must explain more than; `event`: it begins at a moment of its own;
+    `feigned`: gain that noise of the inputs alone may give it; `secant`: all of it is held, and the
+    columns are what it changes at that value, not a slope.
     """
 
     what: Any
@@ -41,6 +41,7 @@ class Trial:
     feigned: float = 0.0
     secant: bool = False
     among: int = 1
+    event: bool = False
 
     @property
     def choices(self) -> int:

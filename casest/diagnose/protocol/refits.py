@@ -199,13 +199,7 @@ def beyond_courses(ranking: Ranking, evidence: Evidence) -> bool:
 def _against(courses: Sequence[Evidence], trial: Trial) -> list[Evidence]:
     """Those that a cause must lead: what begins at a moment of its own only where it does as well,
     since nearly any slow cause looks like that."""
-    event = _at_moments(trial)
-    return [c for c in courses if event or not _at_moments(c.trials[0])]
-
-
-def _at_moments(trial: Trial) -> bool:
-    effect = trial.what.effect
-    return effect is not None and bool({"time", "onset"} & set(dict(effect.profile).values()))
+    return [c for c in courses if trial.event or not c.trials[0].event]
 
 
 def _more_than(course: Evidence, evidence: Evidence, ranking: Ranking) -> bool:

@@ -172,7 +172,9 @@ class Tried:
             describes = self._describes(candidate, motion) and not self.asked(candidate)
             family, trials = candidate.label, candidate.trials
             secant = candidate.all_held(fit.model)
-            found.append(Trial(candidate, family, columns, trials, axes, describes, secant=secant))
+            kinds = dict(candidate.effect.profile).values() if candidate.effect else ()
+            trial = Trial(candidate, family, columns, trials, axes, describes, secant=secant)
+            found.append(replace(trial, event=not {"time", "onset"}.isdisjoint(kinds)))
         return found
 
     def _scales(self, fit: Fit, candidate: Candidate, columns: Array) -> bool:
