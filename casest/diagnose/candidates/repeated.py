@@ -136,13 +136,13 @@ class Reads:
             return f"column goes with {name}: {few}what follows it could be a bend over that"
         if made := self._made_of(x):
             return f"column is made of {made[0]} and {made[1]}, computed from both"
-        late = next((s.name for s in self.signals if s.at_other_times(x)), "")
-        if late:
-            return f"column is {late} at other times: what follows it could be a lag of it"
-        time = self.time
-        sums = (s.name for s in self.signals if time is not None and s.is_integral_of(x, time))
-        of = next(sums, "")
-        return of and f"column is how fast {of} changes: what follows it could be a lag of it"
+        could = "what follows it could be a lag of it"
+        for s in self.signals:
+            if s.at_other_times(x):
+                return f"column is {s.name} at other times: {could}"
+            if self.time is not None and s.is_integral_of(x, self.time):
+                return f"column is how fast {s.name} changes: {could}"
+        return ""
 
     def _made_of(self, x: Array) -> tuple[str, str] | None:
         """A signal of one element and another column of which it is the difference, or of a reading

@@ -227,7 +227,7 @@ class Sensor(Subject[Fit]):
             why = next(filter(None, levels), "")
         for what in (w for w in added if _plain(w) is not None):
             beyond = self._residual_without(after, what) - self.linear(after).residual
-            why = why or at_one_input(what, beyond)
+            why = why or at_one_input(what, beyond, self.linear(after).deviation)
         return why
 
     def _at_grid(self, fit: Fit, added: Sequence[Candidate]) -> Fit | None:

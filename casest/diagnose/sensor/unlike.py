@@ -54,13 +54,14 @@ def _is_of(full: str, label: str, name: str) -> bool:
     return own != full and own.partition("_")[0] == name
 
 
-def at_one_input(what: Candidate, beyond: Array) -> str:
+def at_one_input(what: Candidate, beyond: Array, noise: Array) -> str:
     """Why a cut-off is none: one value alone lies beyond it, which may be off itself; else empty.
 
-    `beyond`: what it takes from each reading (N, m).
+    `beyond`: what it takes from each reading (N, m); what `noise` (m,) may as well do is not.
     """
     size = np.abs(beyond).max(initial=0.0)
-    if size > 0 and len(np.unique(np.round(beyond[beyond != 0] / size, 6))) < 2:
+    clear = beyond[np.abs(beyond) > LEVELS.clip * noise]
+    if size > 0 and len(np.unique(np.round(clear / size, 6))) < 2:
         return f"one input alone lies beyond the level of {what.label}"
     return ""
 
