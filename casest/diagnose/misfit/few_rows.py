@@ -3,14 +3,15 @@
 A fit of few rows bends towards one that is off, and that row no longer stands out. So those few are
 looked for that leave the others the least squares (P. Rousseeuw 1984), near the fit; the chance is
 that of the F test of their own shifts, times the number of ways to choose them: a bound for normal
-noise. Where they are just those at the ends of something recorded, it is no fault of theirs that
+noise. It must hold as well where noise grows with something recorded: the others say how. Where
+they are just those at the ends of something recorded, it is no fault of theirs that
 shows: the model may not reach that far.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import comb
 
 import numpy as np
@@ -24,6 +25,8 @@ from casest.diagnose.misfit.variables import Variable
 FEWEST, MOST_ROWS, SHARE = 6, 5, 0.25
 #: Starts of the search, each of as many rows as determine the unknowns, and steps of each.
 STARTS, STEPS = 50, 20
+#: Logarithm of how small a residual counts as at least, in their median: by chance one is nothing.
+LEAST = 2.0
 
 
 @dataclass(frozen=True)
@@ -35,19 +38,67 @@ class FewRows:
     p_value: float
 
 
-def few_rows(residual: Array, slopes: Array, rounding: float = 0.0) -> FewRows | None:
+def few_rows(
+    residual: Array,
+    slopes: Array,
+    rounding: float = 0.0,
+    variables: Sequence[Variable] = (),
+) -> FewRows | None:
     """Of residuals (N, m) and their slopes (N, m, p); None where no few rows hold most of it, or
-    noise may have done that, which is at least what `rounding` makes (a standard deviation)."""
+    noise may have done that, which is at least what `rounding` makes (a standard deviation), and
+    may grow with any of the `variables`."""
+    found = _few_rows(residual, slopes, rounding)
+    if found is None:
+        return None
+    kept = np.setdiff1d(np.arange(len(residual)), found.rows)
+    Q = _orthonormal(slopes, residual.shape)
+    after = _left(residual, Q, kept[None])[0][0]
+    for variable in variables:
+        size = _growing(after, kept, np.concatenate(variable.values))
+        sized = _orthonormal(slopes / size[:, None, None], residual.shape)
+        chance = _chance(residual / size[:, None], sized, kept, rounding)
+        found = replace(found, p_value=max(found.p_value, chance))
+    return found if found.p_value < LEVELS.chance else None
+
+
+def _growing(after: Array, kept: Index, x: Array) -> Array:
+    """How large noise is at each row (N,), in its usual size, by what `kept` rows (K,) leave
+    (N, m) of a fit to them: as exp(b·x), its logarithm by a line."""
+    log = np.log(np.maximum(np.linalg.norm(after[kept], axis=1), 1e-300))
+    away = (x - x.mean()) / max(float(np.ptp(x)), 1e-300)
+    b = float(np.polyfit(away[kept], np.maximum(log, np.median(log) - LEAST), 1)[0])
+    return np.asarray(np.exp(b * away) / np.exp(b * away[kept].mean()))
+
+
+def _orthonormal(slopes: Array, shape: tuple[int, ...]) -> Array:
+    """Of what the unknowns do (N, m, p): those directions of it that there are."""
+    flat = slopes.reshape(shape[0] * shape[1], -1)
+    length = np.maximum(np.linalg.norm(flat, axis=0), 1e-300)
+    U, size, _ = np.linalg.svd(flat / length, full_matrices=False)
+    return np.asarray(U[:, size > 1e-12 * size.max(initial=0.0)].reshape(*shape, -1))
+
+
+def _chance(residual: Array, Q: Array, kept: Index, rounding: float) -> float:
+    """Of the F test of shifts of all rows but those kept, times the ways to choose them."""
+    from scipy.special import fdtrc
+
+    rows, axes = residual.shape
+    few, most = rows - len(kept), min(MOST_ROWS, int(SHARE * rows))
+    whole, least = (float(_left(residual, Q, k[None])[1][0]) for k in (np.arange(rows), kept))
+    rest = residual.size - Q.shape[2] - axes * few
+    F = (whole - least) / (axes * few) / max(least / rest + rounding**2, 1e-300)
+    return min(1.0, float(fdtrc(axes * few, rest, F)) * comb(rows, few) * most)
+
+
+def _few_rows(residual: Array, slopes: Array, rounding: float) -> FewRows | None:
+    """The same of noise that is alike everywhere."""
     from scipy.special import fdtrc
 
     rows, axes = residual.shape
     most = min(MOST_ROWS, int(SHARE * rows))
-    flat = slopes.reshape(residual.size, -1)
-    length = np.maximum(np.linalg.norm(flat, axis=0), 1e-300)
-    if rows < FEWEST or not np.isfinite(length).all():
+    if rows < FEWEST or not np.isfinite(slopes).all():
         return None
-    U, size, _ = np.linalg.svd(flat / length, full_matrices=False)
-    Q = U[:, size > 1e-12 * size.max(initial=0.0)].reshape(rows, axes, -1)
+    Q = _orthonormal(slopes, residual.shape)
     freedom = residual.size - Q.shape[2]
     if not Q.size or freedom < 1:  # of an estimate that is refused nothing may be determined
         return None
@@ -62,8 +113,7 @@ def few_rows(residual: Array, slopes: Array, rounding: float = 0.0) -> FewRows |
         one = (before - least) / axes / max(noise, 1e-300)
         if best is not None and float(fdtrc(axes, rest, one)) * (rows - k) > LEVELS.chance:
             break  # one more is the furthest of the others, as one of them is
-        F = (whole - least) / (axes * k) / max(noise, 1e-300)
-        chance = min(1.0, float(fdtrc(axes * k, rest, F)) * comb(rows, k) * most)
+        chance = _chance(residual, Q, kept, rounding)
         share = 1 - least / max(whole, 1e-300)
         if share > LEVELS.most and chance < LEVELS.chance:
             best = FewRows(np.setdiff1d(np.arange(rows), kept), share, chance)

@@ -151,14 +151,14 @@ def in_few_rows(problem: Problem, point: Point) -> list[Finding]:
         return []
     residual = np.concatenate(problem.residuals(point))
     J = np.nan_to_num(problem.jacobian(point)).reshape(*residual.shape, -1)
-    found = few_rows(residual, J, _rounding(problem))
-    if found is None:
-        return []
-    listed = " and ".join(_named(runs, found.rows))
     columns = usable_columns(problem.model, runs)
     read = variables(problem, point, columns)
     if problem.model.implicit:  # a reading that is off is beyond the others in what it makes
         read = [v for v in read if v.clock or v.name in columns]
+    found = few_rows(residual, J, _rounding(problem), read)
+    if found is None:
+        return []
+    listed = " and ".join(_named(runs, found.rows))
     ends = at_the_ends(found.rows, read)
     why = f"at {ends}" if ends else "which the others speak against"
     where = f"{100 * found.share:.0f} % of it is in {listed}, {why}"
