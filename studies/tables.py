@@ -166,7 +166,9 @@ HEAD = """# Short tables
 Made by `make study-tables` (`python studies/tables.py`): `linear`, closed on tables of {} to {}
 rows without a time, seeds from {} on. Named: a cause that is right is claimed (of a bend any
 polynomial, a saturation, a dead zone: which shape a short table cannot say). Right: the verdict is
-one that the table supports; `adequate` or noise beside a jump is wrong.
+one that the table supports; `adequate` or noise beside a jump is wrong. A row that is far out in
+Student's t noise is one that the others speak against (`unexplained`), as one that is odd is: no
+table tells the two apart, and here the one counts as wrong and the other as right.
 
 | table | tables | named | adequate | extended | unexplained | no answer | right | wrong causes |
 | --- | --- | --- | --- | --- | --- | --- | --- | --- |
