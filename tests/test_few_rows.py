@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from itertools import combinations
 
 import numpy as np
@@ -84,6 +85,20 @@ def test_rows_at_the_ends_of_an_input_are_called_that():
     assert at_the_ends(np.arange(5), [variable("place", np.arange(38), clock=True)]) == (
         "one end of the record"
     )
+
+
+@pytest.mark.parametrize("far", [1.0, 1e9])
+def test_a_column_that_tells_the_odd_row_alone_says_nothing_of_the_others(far):
+    """A mark in that row: how noise grows with it nobody knows, and no warning is printed."""
+    rng = np.random.default_rng(5)
+    r, X = table(rng, 20, 1, 2, off=[(7, 15.0)])
+    for others in (np.zeros(20), 1e-6 * rng.standard_normal(20)):
+        mark = np.where(np.arange(20) == 7, far, others)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            found = few_rows(r, X, variables=[variable("mark", mark)])
+        if not others.any():
+            assert list(found.rows) == [7]
 
 
 def test_rows_that_are_chosen_at_random_are_at_no_end():

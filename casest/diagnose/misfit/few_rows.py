@@ -4,8 +4,8 @@ A fit of few rows bends towards one that is off, and that row no longer stands o
 looked for that leave the others the least squares (P. Rousseeuw 1984), near the fit; the chance is
 that of the F test of their own shifts, times the number of ways to choose them: a bound for normal
 noise. It must hold as well where noise grows with something recorded: the others say how. Where
-they are just those at the ends of something recorded, it is no fault of theirs that
-shows: the model may not reach that far.
+they are just those at the ends of something recorded, it is no fault of theirs that shows: the
+model may not reach that far.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ FEWEST, MOST_ROWS, SHARE = 6, 5, 0.25
 STARTS, STEPS = 50, 20
 #: Logarithm of how small a residual counts as at least, in their median: by chance one is nothing.
 LEAST = 2.0
+#: The same of how far noise may grow beyond the rows that say how.
+FURTHEST = 5.0
 
 
 @dataclass(frozen=True)
@@ -63,11 +65,14 @@ def few_rows(
 
 def _growing(after: Array, kept: Index, x: Array) -> Array:
     """How large noise is at each row (N,), in its usual size, by what `kept` rows (K,) leave
-    (N, m) of a fit to them: as exp(b·x), its logarithm by a line."""
+    (N, m) of a fit to them: as exp(b·x), its logarithm by a line. Of an x that these do not vary
+    nothing is known."""
     log = np.log(np.maximum(np.linalg.norm(after[kept], axis=1), 1e-300))
-    away = (x - x.mean()) / max(float(np.ptp(x)), 1e-300)
-    b = float(np.polyfit(away[kept], np.maximum(log, np.median(log) - LEAST), 1)[0])
-    return np.asarray(np.exp(b * away) / np.exp(b * away[kept].mean()))
+    log = np.maximum(log, np.median(log) - LEAST)
+    away = (x - x[kept].mean()) / max(float(np.ptp(x)), 1e-300)
+    squares = float(away[kept] @ away[kept])
+    b = float(away[kept] @ log) / squares if squares > 1e-18 else 0.0
+    return np.asarray(np.exp(np.clip(b * away, -FURTHEST, FURTHEST)))
 
 
 def _orthonormal(slopes: Array, shape: tuple[int, ...]) -> Array:

@@ -62,7 +62,7 @@ def at_one_input(what: Candidate, beyond: Array, noise: Array) -> str:
     size = np.abs(beyond).max(initial=0.0)
     clear = beyond[np.abs(beyond) > LEVELS.clip * noise]
     if size > 0 and len(np.unique(np.round(clear / size, 6))) < 2:
-        return f"one input alone lies beyond the level of {what.label}"
+        return f"one input alone lies clearly beyond the level of {what.label}"
     return ""
 
 
